@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
-from kf_calib.sources.text.cells import LineError
 from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
@@ -62,22 +59,11 @@ def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:
         return False
-    step_s = _step_s(columns)
-    return _are_alike(columns) if math.isnan(step_s) else step_s < _SLOWEST_S
-
-
-def _step_s(columns: Columns) -> float:
-    """Return the usual step from row to row, s; NaN where no time can be told."""
     try:
-        time = columns.time()
+        steps_ns = np.abs(np.diff(columns.stamps_ns(columns.time())))
     except InputError:
-        return math.nan
-    stamps = list[int]()
-    for number, row in enumerate(columns.rows):
-        with suppress(LineError):
-            stamps.append(time.ns(row, columns.header, columns.numbers, number))
-    steps = np.abs(np.diff(np.array(stamps, float)))
-    return float(np.median(steps)) / 1e9 if len(steps) else math.nan
+        return _are_alike(columns)
+    return bool(len(steps_ns)) and float(np.median(steps_ns)) < 1e9 * _SLOWEST_S
 
 
 def _are_alike(columns: Columns) -> bool:

@@ -381,4 +381,4 @@ def is_lines(head: bytes) -> bool:
     text = head.decode("utf-8-sig", errors="replace")[:-1]  # the last character may be cut
     first = text.lstrip().partition("\n")[0]
     is_printed = "\ufffd" not in text and not any(c < " " and c not in "\t\r\n\f" for c in text)
-    return is_printed and (first[:1] in ("{", "[") or any(c in text for c in ",;\t"))
+    return is_printed and (first[:1] in ("{", "[") or any(c in text for c in ",;\t") or len(first.split()) > 2)

@@ -18,9 +18,13 @@ CsvRow = Sequence[str]
 _NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
 _PLAIN = str.maketrans("−", "-", "'’ \u00a0\u202f")
 _LOCAL = re.compile(
-    r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})[,T ]*\s*(?:(\d{1,2})[:.](\d{2})(?:[:.](\d{2})(?:[.,](\d+))?)?)?"
+    r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})[,T ]*\s*(?:(\d{1,2})[:.](\d{2})(?:[:.](\d{2})(?:[.,:](\d+))?)?)?"
     r"\s*([AaPp][Mm])?\s*(Z|UTC|GMT|CET|MEZ|CEST|MESZ|[+-]\d{2}:?\d{2})?"
 )
+_CLOCK = re.compile(r"(?:(\d+) days? )?(?:(\d{1,3}):)?(\d{1,2}):(\d{2})(?:[.,:](\d{1,6})\d*)?")
+_MONTH = re.compile(r"(?<=\d)[-/. ]+([^\W\d]{3})[^\W\d]*[-/. ,]+(?=\d)")
+_NAMES_OF_MONTHS = "janfebmaraprmayjunjulaugsepoctnovdecjanfebmäraprmaijunjulaugsepoktnovdez"
+_MONTHS = {name: k % 12 + 1 for k, name in enumerate(re.findall("...", _NAMES_OF_MONTHS))}
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -146,14 +150,15 @@ def written(value: float) -> float:
 
 @dataclass(frozen=True)
 class Stamps:
-    """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
+    """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in several.
 
-    unit_ns: nanoseconds in the unit; 0 of stamps of a calendar. month_first: how these are written; has_zone: whether
-    they name their time zone. rate_hz: of the rows, which have no time then.
+    units_ns: nanoseconds in the unit of each of the last columns; stamps of a calendar have none, to which these are
+    added. month_first: how stamps of a calendar are written; has_zone: whether they name their time zone. rate_hz: of
+    the rows, which have no time then.
     """
 
     at: tuple[int, ...]
-    unit_ns: int
+    units_ns: tuple[int, ...]
     month_first: bool = False
     has_zone: bool = False
     rate_hz: float | None = None
@@ -163,20 +168,25 @@ class Stamps:
         """How the stamps of a calendar in columns ``at`` are written; raises ValueError where the first is none."""
         month_first = _month_comes_first(texts)
         has_zone = bool(texts) and _stamp_of(texts[0], month_first).tzinfo is not None
-        return cls(tuple(at), 0, month_first, has_zone)
+        return cls(tuple(at), (), month_first, has_zone)
 
     def ns(self, row: Sequence[str], header: Sequence[str], numbers: Numbers, number: int = 0) -> int:
         """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
         if self.rate_hz is not None:
             return round(number * 1e9 / self.rate_hz)
-        cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
+        begin, parts = len(self.at) - len(self.units_ns), self.at
+        cell = row[parts[0]] if len(parts) == 1 else " ".join(row[at] for at in parts[: begin or None])
         try:
-            if self.unit_ns:
-                return stamp_ns(numbers.exact(cell), self.unit_ns)
+            since_ns = 0
+            if self.units_ns:
+                counted = zip(parts[begin:], self.units_ns, strict=True)
+                since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
+                if not begin:
+                    return since_ns
             stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST
-                return stamp_ns(since // timedelta(microseconds=1), 1000)
+                return stamp_ns(since // timedelta(microseconds=1), 1000) + since_ns
         except LineError:
             raise
         except (ValueError, ArithmeticError):
@@ -211,11 +221,17 @@ def _month_comes_first(texts: Sequence[str]) -> bool:
 
 
 def _stamp_of(text: str, month_first: bool) -> datetime:
-    """Return the stamp that a text says; raises ValueError where it says none."""
+    """Return the stamp that a text says, one of a clock alone since 1970; raises ValueError where it says none."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:
-        match = _LOCAL.fullmatch(text.strip())
+        match = _LOCAL.fullmatch(_MONTH.sub(_numbered, text.strip()))
+    if clock := _CLOCK.fullmatch(text.strip()):
+        days, *times, fraction = clock.groups("")
+        if not times[0] and not fraction:
+            times = [*times[1:], ""]  # hours and minutes
+        hours, minutes, seconds = (int(each or 0) for each in times)
+        return datetime(1970, 1, 1) + timedelta(int(days or 0), seconds, int(f"{fraction:0<6}"), 0, minutes, hours)
     if not match:
         raise ValueError
     first, second, third, hour, minute, second_s, fraction, half, zone = match.groups("")
@@ -228,3 +244,9 @@ def _stamp_of(text: str, month_first: bool) -> datetime:
     date = f"{int(year) + 2000 * (len(year) <= 2):04d}-{int(month):02d}-{int(day):02d}"
     clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}.{(fraction + '000000')[:6]}"
     return datetime.fromisoformat(f"{date}T{clock}{offset}")
+
+
+def _numbered(month: re.Match[str]) -> str:
+    """Return the name of a month between day and year as its number."""
+    number = _MONTHS.get(month[1].lower())
+    return f"-{number}-" if number else month[0]

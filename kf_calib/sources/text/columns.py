@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,11 +18,12 @@ from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import OPTIONS, PLAIN
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.text.cells import DECIMAL_POINT, CsvRow, Numbers, QuantityColumns, Stamps, are_stamps
+from kf_calib.sources.text.cells import DECIMAL_POINT, CsvRow, LineError, Numbers, QuantityColumns, Stamps, are_stamps
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import (
     ACCEL,
     ANGLE,
+    NAMELESS,
     QUATERNION,
     TIME,
     Meaning,
@@ -45,10 +47,12 @@ _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 _NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
 """What people write where there is no temperature."""
-_TIME_ALONE = {"t": "", "sec": "", "secs": "", "millis": "ms", "micros": "us"}
+_TIME_ALONE = ("t", "x_value")
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
 """Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
+_FEWEST = 2.0
+"""Readings behind a mean."""
 _MOST_CELLS = 0.6  # of a column of readings are numbers: a bad one is told later
 
 
@@ -78,14 +82,18 @@ class Columns:
             self._choose_rows(self.units.where)
         self.meanings = meanings_of(self.header, stated)
         self.numbers = self.numbers_in(self.rows) or DECIMAL_POINT
+        for k in self.places("count"):
+            counts = self.values([k])[:, 0]
+            if len(counts) > 1 and ((np.diff(counts) == 1.0).mean() > _MOST_CELLS or counts.max() < _FEWEST):
+                self.meanings[k] = Meaning()  # the number of the row
         if is_nameless(self.header) and not stated:
             self._recognise_numbers()
         if is_table:
             self._recognise_contents({k for k, name in enumerate(self.header) if name in stated})
         elif not self.has("time"):
-            for k, name in enumerate(self.names):
-                if (unit := _TIME_ALONE.get(name.strip().lower())) is not None:
-                    self.meanings[k] = Meaning("time", unit)
+            alone = [k for k, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE]
+            for k in alone[:1] or list(filter(self._are_stamps, self.unknown)):
+                self._guess(k, "time")
 
     def _choose_rows(self, where: str) -> None:
         """Keep the rows with a text in a column, as ``I=0``; raises InputError where none has it."""
@@ -113,9 +121,10 @@ class Columns:
         if len(places) > 1:
             if len({self.names[at].lower() for at in places}) == 1:
                 raise InputError(f"two columns are named {self.names[places[0]]!r}: rename or remove one of them.")
+            kinds = READINGS if ours in READINGS and self.has(*READINGS) else (ours,)
+            example = " ".join(f"--column {f'{self.header[self.places(kind)[0]]}={kind}'!r}" for kind in kinds)
             raise InputError(
-                f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by "
-                f"--column {f'{self.header[places[0]]}={ours}'!r}."
+                f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by {example}."
             )
         return places[0] if places else None
 
@@ -132,6 +141,11 @@ class Columns:
         return self.chosen is None or row[self.chosen[0]].strip() == self.chosen[1]
 
     @property
+    def unknown(self) -> list[int]:
+        """Indices of the columns whose names say nothing."""
+        return [k for k, own in enumerate(self.meanings) if not own.ours and not own.other]
+
+    @property
     def unused(self) -> list[int]:
         """Indices of the columns that mean nothing here."""
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.header[k]]
@@ -142,8 +156,8 @@ class Columns:
 
     @property
     def _left_over(self) -> str:
-        """The name of a column that means nothing yet, for an example."""
-        return next((self.header[k] for k in self.unused), "THEIRS")
+        """The name of a column that means nothing yet, if possible one of numbers, for an example."""
+        return next((self.header[k] for k in sorted(self.unused, key=self._are_numbers, reverse=True)), "THEIRS")
 
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
@@ -155,6 +169,11 @@ class Columns:
         """The numbers (n, k) in columns, NaN where there is none."""
         values = [self.numbers.values([row[at] for at in places]) for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
+
+    def _finite(self, place: int) -> Floats:
+        """Return the numbers (n,) in a column, without what is none."""
+        values = self.values([place])[:, 0]
+        return values[np.isfinite(values)]
 
     # -- what kind of text it is --
 
@@ -179,58 +198,100 @@ class Columns:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
         if self.units.rate_hz is not None:
             self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
-            return Stamps((), 1, rate_hz=self.units.rate_hz)
-        places = self.places("time")
+            return Stamps((), (), rate_hz=self.units.rate_hz)
+        nothing = {"", *_NOTHING}
+        filled = [at for at in self.places("time") if any(row[at].lower() not in nothing for row in self.rows)]
+        places = filled if self.rows else self.places("time")
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
                 f"--rate 100; {WANTED}, not {self._all}."
             )
         exact = [at for at in places if is_exact(self.names[at])]
-        best = exact or [at for at in places if self.meanings[at].unit] or places
-        place = min(best, key=self._unevenness) if len(best) > 1 else best[0]
-        unit, values = self.meanings[place].unit, self.values([place])[:, 0]
-        values = values[[bool(row[place]) for row in self.rows]]
-        if not unit and len(values) and math.isnan(values[0]):
-            return self._dates(places[:2] if place == places[0] else [place])
-        unit = unit or self._unit_of_time(place, values[np.isfinite(values)])
+        ways = [way for at in exact or places if (way := self._stamps_in(at, places))]
+        if parts := self._parts_of_time(ways):
+            ways.append(parts)
+        if not ways:
+            raise self._without_time(places[0])
+        stamps = min(ways, key=self._unevenness) if len(ways) > 1 else ways[0]
         if self.is_table or not exact:
-            self.said.append(f"time from {self.named([place])} in {unit}")
-        return Stamps((place,), round(TIME[unit] * 1e9))
+            zone = " (UTC, since no time zone is named)" * (self.is_table and not (stamps.units_ns or stamps.has_zone))
+            unit = f" in {' and '.join(name for ns in stamps.units_ns for name, s in TIME.items() if ns == s * 1e9)}"
+            self.said.append(f"time from {self.named(stamps.at)}{unit * bool(stamps.units_ns)}{zone}")
+        return stamps
 
-    def _unevenness(self, place: int) -> float:
-        """Return how much the steps of a column of stamps differ from the usual one; infinite where it does not go
-        up."""
-        steps = np.diff(self.values([place])[:, 0])
-        steps = steps[np.isfinite(steps)]
+    def _stamps_in(self, place: int, places: Sequence[int]) -> Stamps | None:
+        """How stamps in a column are written, of which the next of ``places`` may have the time of day; None where this
+        or their unit is not told."""
+        first = next((row[place] for row in self.rows if row[place]), "0")
+        if not self.meanings[place].unit and math.isnan(self.numbers.value(first)):
+            return self._dates(places[:2] if place == places[0] else [place])
+        unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
+        return Stamps((place,), (round(TIME[unit] * 1e9),)) if unit else None
+
+    def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
+        """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
+        whole seconds or beside stamps of a calendar that have no more; None where there are none such."""
+        numbers = [(way.units_ns[0], way.at[0], self._finite(way.at[0])) for way in reversed(ways) if way.units_ns]
+        parts = {unit: (at, values) for unit, at, values in numbers if (values == np.rint(values)).all()}
+        finest = min(parts, default=0)
+        parts |= {unit: (at, values) for unit, at, values in numbers if unit < finest}
+        units = sorted(parts, reverse=True)
+        sizes = [float(parts[unit][1].max(initial=0.0)) * unit for unit in units]
+        dated = next((way for way in ways if not way.units_ns), None)
+        if len(units) > 1 and all(size <= unit for size, unit in zip(sizes[1:], units, strict=False)):
+            return Stamps(tuple(parts[unit][0] for unit in units), tuple(units))
+        if dated and units and sizes[0] <= 1e9 and not (self.stamps_ns(dated) % 1e9).any():
+            return replace(dated, at=(*dated.at, parts[units[0]][0]), units_ns=(units[0],))
+        return None
+
+    def _unevenness(self, stamps: Stamps) -> float:
+        """Return how much the steps of stamps differ from the usual one, and how often they do not go up."""
+        steps = np.diff(self.stamps_ns(stamps))
         usual = float(np.median(steps)) if len(steps) else 0.0
-        return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
+        if usual <= 0.0:
+            return math.inf
+        return float(np.median(np.abs(steps - usual))) / usual + float((steps <= 0.0).mean()) * len(stamps.at)
 
-    def _unit_of_time(self, place: int, values: Floats) -> str:
-        """Return the unit of stamps (n,) whose name tells none, by their size or their steps; of means, it is s."""
-        step = float(np.median(np.abs(np.diff(values)))) if len(values) > 1 else 0.0
+    def stamps_ns(self, stamps: Stamps) -> Floats:
+        """The stamps (n,) of the rows that have any."""
+        found = list[int]()
+        for number, row in enumerate(self.rows):
+            with suppress(LineError):
+                found.append(stamps.ns(row, self.header, self.numbers, number))
+        return np.array(found, float)
+
+    def _unit_of_time(self, values: Floats) -> str:
+        """Return the unit of stamps (n,) whose name tells none, by their size or their steps; empty where nothing does.
+
+        It is s of means, and where several stamps have the same whole number."""
+        steps = np.abs(np.diff(values))
+        step = float(np.median(steps)) if len(steps) else 0.0
+        if len(steps) and step == 0.0 and steps.max() == 1.0:
+            return "s"
         by_size = unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s" * self.is_table
-        if unit := by_size or next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
-            return unit
-        name = self.header[place]
-        raise InputError(
-            f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
-            f"{WANTED}, not {self._all}."
+        return by_size or next((unit for low, high, unit in _OF_STEPS if low < step < high), "")
+
+    def _without_time(self, place: int) -> InputError:
+        """That a column gives no time that can be read, or not in which unit."""
+        name, first = self.header[place], next((row[place] for row in self.rows if row[place]), "")
+        if math.isnan(self.numbers.value(first)):
+            return InputError(
+                f"no column gives the time: column {self.named([place])} is {cut(first, 40)!r}, write seconds, or "
+                "stamps such as 2026-05-04T13:45:00.010+02:00."
+            )
+        return InputError(
+            f"no column gives the time with its unit: say which {name!r} has, for example --column "
+            f"'{name}=time_ms', or give the rate of the rows by --rate; {WANTED}, not {self._all}."
         )
 
-    def _dates(self, places: Sequence[int]) -> Stamps:
+    def _dates(self, places: Sequence[int]) -> Stamps | None:
         """How stamps of a calendar are written; of two columns the second may give the time of day."""
         rows = [[row[at] for at in places] for row in self.rows if all(row[at] for at in places)]
         for count in (len(places), 1):
             with suppress(ValueError):
-                stamps = Stamps.of_dates(places[:count], [" ".join(cells[:count]) for cells in rows])
-                zone = " (UTC, since no time zone is named)" if self.is_table and not stamps.has_zone else ""
-                self.said.append(f"time from {self.named(places[:count])}{zone}")
-                return stamps
-        raise InputError(
-            f"no column gives the time: column {self.named(places[:1])} is {cut(rows[0][0] if rows else '', 40)!r}, "
-            "write seconds, or stamps such as 2026-05-04T13:45:00.010+02:00."
-        )
+                return Stamps.of_dates(places[:count], [" ".join(cells[:count]) for cells in rows])
+        return None
 
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
@@ -362,13 +423,22 @@ class Columns:
                 self._guess(k, "face")
             elif kind == "" and not self.has("time") and are_stamps(cells):
                 self._guess(k, "time")
-        left = [k for k, own in enumerate(self.meanings) if not own.ours and not own.other and k not in stated]
+        left = [k for k in self.unknown if k not in stated]
         numeric = [] if self.places(*READINGS) else [k for k in left if self._are_numbers(k)]
         norms = lengths(self.values(numeric)) if len(numeric) == len(READINGS) else np.zeros(0)
         norms = norms[np.isfinite(norms)]
         if norms.size and 0 < norms.max() < _ALIKE * norms.min():
             for k, ours in zip(numeric, READINGS, strict=True):
                 self._guess(k, ours)
+
+    def _are_stamps(self, place: int) -> bool:
+        """Whether a column holds stamps of a calendar or, without a name, seconds that go up."""
+        if not (self.rows and self._are_numbers(place)):
+            return are_stamps([row[place] for row in self.rows])
+        steps = np.diff(self._finite(place))
+        return self.header[place] in ("", NAMELESS.format(place + 1)) and bool(
+            (steps > 0.0).all() and (steps % 1.0).any()
+        )
 
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = self.meanings[place]._replace(ours=ours)

@@ -17,7 +17,8 @@ from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.sources.text.units import celsius
 from kf_calib.support.text import cut
 
-_MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
+_MINUTE_NS = 60 * 10**9
+_BACK = {60 * _MINUTE_NS: "an hour, as at the end of summer time", 1440 * _MINUTE_NS: "a day, as clocks do at midnight"}
 _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 
 
@@ -82,7 +83,7 @@ class CsvLines(LineReader):
             return None
         numbers = self._numbers or DECIMAL_POINT
         time_ns = self._time.ns(row, self._header, numbers, number)
-        if not self._time.unit_ns:
+        if len(self._time.at) > len(self._time.units_ns):
             time_ns = self._of_even_clock(time_ns)
         readings = self._accel.values(row, self._header, numbers)
         angles = self._pose.values(row, self._header, numbers)
@@ -92,12 +93,13 @@ class CsvLines(LineReader):
         return time_ns, readings, angles, degrees and [celsius(degrees[0], self._unit)]
 
     def _of_even_clock(self, time_ns: int) -> int:
-        """Return a stamp of a calendar with the hour by which local clocks go back at the end of summer time."""
+        """Return a stamp with what a calendar or a clock goes back by: an hour at the end of summer time, or a day."""
         time_ns += self._added_ns
-        if _HOUR_NS - _MINUTE_NS < self._last_ns - time_ns <= _HOUR_NS:
-            self._added_ns += _HOUR_NS
-            time_ns += _HOUR_NS
-            self.said.append("its stamps go back by an hour, as at the end of summer time: those after it count on")
+        for back_ns, when in _BACK.items():
+            if back_ns - _MINUTE_NS < self._last_ns - time_ns <= back_ns:
+                self._added_ns += back_ns
+                time_ns += back_ns
+                self.said.append(f"its stamps go back by {when}: those after it count on")
         self._last_ns = max(self._last_ns, time_ns)
         return time_ns
 
@@ -115,7 +117,7 @@ def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
     for at, name in enumerate(columns.names):
         labels = [row[at].strip() for row in columns.rows]
         shares, turns = Counter(labels), np.flatnonzero([one != other for one, other in pairwise(labels)])
-        are_few = name and at not in used and 2 <= len(shares) <= _MOST_UNITS and max(map(len, shares)) <= 16
+        are_few = name and at not in used and 2 <= len(shares) <= _MOST_UNITS and max(map(len, shares)) <= 40
         if not are_few or "" in shares or min(shares.values()) < 0.1 * len(labels) or len(turns) < 0.3 * len(labels):
             continue
         first = min(shares)

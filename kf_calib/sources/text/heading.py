@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
+from kf_calib.sources.text.cells import are_stamps
 from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
 
 _DELIMITERS = ";\t,|"
@@ -19,15 +21,21 @@ _TELLING = 200  # lines by which the delimiter is told
 _FEWEST_CELLS = 3
 """Of a header; a line of fewer is a title, a date or a serial number."""
 _ROWS = 1000  # that are looked at
-_MARK = re.compile(r"\s*(?:#|%|//)+\s*")
+_TITLES, _RUN = 30, 50  # rows among which the names are, and rows of values that are no list above them
+_MARK = re.compile(r"\s*(?:#|%|;|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
 _BLANK_CELL = re.compile(r'"[^"]*"|\S+')
-_LABELLED = re.compile(
-    r"(?<!\w)([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*([+\-−]?\d[\d.]*(?:[eE][+\-]?\d+)?|[+\-−]?\.\d+)"
-    r"(?:\s*((?:[^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])))?"
+_IN_TEXT = re.compile(
+    r"(?<![\w.*])(?:\d{1,4}[./-]\d\d?[./-]\d{1,4}[T ])?(?:\d\d?:\d\d:\d\d(?:[.,]\d+)?"
+    r"|[+\-−]?(?:\d+\.?\d*|\.\d+)(?:[eE][+\-]?\d+)?)(?![\d.xX])"
 )
-_FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
+"""A number or a stamp amid other text; what follows an asterisk is a sum of a check."""
+_LABEL = re.compile(r"([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*[(\[]?\s*$")
+_UNIT_BEHIND = re.compile(r"\s*([^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])")
+_FEWEST_LABELS, _LONGEST_LABELLED, _LONGEST_LABEL = 3, 1000, 60
+_JSON = "{"
+_JSON_TOKEN = re.compile(r'"((?:[^"\\]|\\.)*)"(\s*:)?|[{}\[\],]|[^\s{}\[\],:"]+')
 
 
 class TextHeading(NamedTuple):
@@ -59,16 +67,35 @@ class TextHeading(NamedTuple):
         if is_whole:
             reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
             cells = [(start + reader.line_num - 1, [cell.strip() for cell in row]) for row in reader]
-            return cls.of_cells(cells, delimiter)
-        first = enumerate(lines[start : start + 2 * _ROWS], start)
-        heading = cls.of_cells([(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first], delimiter)
-        return heading._replace(rows=heading.rows[:_ROWS])
+        else:
+            first = enumerate(lines[start : start + 2 * _ROWS], start)
+            cells = [(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first]
+        heading = cls.of_cells(cells, delimiter)
+        if count := _numbers_amid(lines[:_ROWS], heading):
+            names = [NAMELESS.format(k + 1) for k in range(count)]
+            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], [""] * count, names, is_whole)
+        return heading if is_whole else heading._replace(rows=heading.rows[:_ROWS])
+
+    @classmethod
+    def of_json(cls, lines: Sequence[str]) -> TextHeading | None:
+        """The heading of lines with an object each, of which the scalars are the cells; None where these are too few
+        for three readings."""
+        found = [{path: line[start:end] for path, start, end in scalars(line)} for line in lines[:_ROWS]]
+        header = list(dict.fromkeys(path for cells in found for path in cells if path))
+        rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
+        return (
+            cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows)))
+            if len(header) >= _FEWEST_CELLS
+            else None
+        )
 
     @classmethod
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
         """The heading of cells with the number of the line of each."""
         filled = [own for own in cells if any(own[1])]
         header, begin, named = _header_in([own for _, own in filled]) if filled else ([], 0, ())
+        widest = max((len(own) for _, own in filled[begin:]), default=0)
+        header = header[:widest] if widest >= _FEWEST_CELLS else header
         rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not _is_comment(own)]
         behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
         names = tuple(filled[k][0] for k in named)
@@ -93,12 +120,15 @@ class TextHeading(NamedTuple):
     def cells(self, line: str) -> list[str]:
         """The cells of a line below; none where it has other labels than those of readings."""
         if self.labels:
-            return [line[start:end] for start, end in self.spans(line)]
+            return [line[start:end].strip('"') for start, end in self.spans(line)]
         return cells_of(line, self.delimiter)
 
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
+        if self.delimiter == _JSON:
+            places = {path: (start, end) for path, start, end in scalars(line)}
+            return [places.get(path, (0, 0)) for path in self.labels] if places else []
         if self.labels:
             lacking = len(self.header) - len(self.labels)  # of a face that stands in a line of its own
             return [(0, 0)] * lacking + _labelled_spans(line, self.labels)
@@ -114,33 +144,78 @@ class TextHeading(NamedTuple):
         ]
 
 
+def scalars(line: str) -> Iterator[tuple[str, int, int]]:
+    """The path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none."""
+    keys = list[str | int]()
+    for match in _JSON_TOKEN.finditer(line):
+        if match[2] and keys:
+            keys[-1] = match[1]
+        elif match[0] in ("{", "["):
+            keys.append("" if match[0] == "{" else 0)
+        elif match[0] in ("}", "]"):
+            del keys[-1:]
+        elif match[0] == ",":
+            keys[-1:] = [key + 1 if isinstance(key, int) else key for key in keys[-1:]]
+        elif match[0] != "null":
+            yield ".".join(map(str, keys)), *match.span()
+
+
 def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """Return the labels in the first of lines that name an accelerometer, and with their units the names of the columns
     that they make; None where none do."""
     seen = list[list[str]]()
     for line in lines:
-        labelled = _labelled_in(line)
-        labels = [match[1] for match in labelled]
-        if len(labels) < _FEWEST_LABELS or labels in seen:
+        labels, units, _ = _labelled_in(line) if ":" in line or "=" in line else ([], [], [])
+        if sum(map(bool, labels)) < _FEWEST_LABELS or labels in seen:
             continue
         seen.append(labels)
-        units = [match[3] if is_unit(match[3] or "") else "" for match in labelled]
-        header = [f"{label} [{unit}]" if (unit := own or units[-1]) else label
-                  for label, own in zip(labels, units, strict=True)]  # fmt: skip
-        if {own.ours for own in meanings_of(header, {})} >= {"ax", "ay", "az"}:
+        named = [label or NAMELESS.format(k + 1) for k, label in enumerate(labels)]
+        header = [f"{name} [{unit or units[-1]}]" if label and (unit or units[-1]) else name
+                  for name, label, unit in zip(named, labels, units, strict=True)]  # fmt: skip
+        if _tell_readings(header):
             return labels, header
     return None
 
 
 def _labelled_spans(line: str, labels: Sequence[str]) -> list[tuple[int, int]]:
     """Return where the values stand in a line; none where it has other labels."""
-    labelled = _labelled_in(line)
-    return [match.span(2) for match in labelled] if [match[1] for match in labelled] == labels else []
+    found, _, spans = _labelled_in(line)
+    return spans if found == labels else []
 
 
-def _labelled_in(line: str) -> list[re.Match[str]]:
-    """Return label, value and what follows it, of all in a line."""
-    return list(_LABELLED.finditer(line)) if (":" in line or "=" in line) and len(line) < _LONGEST_LABELLED else []
+def _labelled_in(line: str) -> tuple[list[str], list[str], list[tuple[int, int]]]:
+    """Return the labels and units of all numbers and stamps in a line, empty where there are none, and where they
+    stand; a label before three numbers is that of a vector."""
+    spans = [match.span() for match in _IN_TEXT.finditer(line)] if len(line) < _LONGEST_LABELLED else []
+    labels, units, end = list[str](), list[str](), 0
+    for (start, behind), (after, _) in pairwise([*spans, (len(line), 0)]):
+        label, unit = (
+            _LABEL.search(line[max(end, start - _LONGEST_LABEL) : start]),
+            _UNIT_BEHIND.match(line, behind, after),
+        )
+        labels.append(label[1] if label else "")
+        units.append(unit[1] if unit and is_unit(unit[1]) else "")
+        end = unit.end() if unit and units[-1] else behind
+    for k, label in enumerate(labels):
+        if label and labels[k + 1 : k + 3] == ["", ""] and all(labels[k + 3 : k + 4]):
+            labels[k : k + 3] = [f"{label} {axis}" for axis in "xyz"]
+    return labels, units, spans
+
+
+def _numbers_amid(lines: Sequence[str], heading: TextHeading) -> int:
+    """Return how many numbers most lines of a print have, amid other text and without labels; 0 where cells are told
+    better by a delimiter."""
+    rows = heading.rows[:_TELLING]
+    if _tell_readings(heading.header) or 2 * sum(any(map(_is_amid, row)) for row in rows) <= len(rows):
+        return 0
+    counts = [len(labels) for line in lines if not any(labels := _labelled_in(line)[0])]
+    counts = [count for count in counts if count >= _FEWEST_CELLS]
+    return max(set(counts), key=counts.count) if 2 * len(counts) > len(lines) else 0
+
+
+def _is_amid(cell: str) -> bool:
+    """Return whether a number stands amid other text in a cell."""
+    return not _NUMBER.fullmatch(cell) and _IN_TEXT.search(cell) is not None and not are_stamps([cell])
 
 
 def _delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
@@ -164,25 +239,43 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
     """Return the names of the columns, the place of the first row of values, and those of names and units.
 
     rows: cells of lines that have any. Comments and titles are passed over. The names are the first line of three cells
-    or more, or, where that holds numbers, the comment before it that has as many; where there is none, columns have
-    numbers.
+    or more that tell three readings, or else the first such line that is not followed by another one above all values,
+    or, where that holds numbers, the comment before it that has as many; where there is none, columns have numbers.
     """
-    at = next((k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)), None)
-    if at is None:  # whatever it is, it is told by its first line
+    wide = [k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)]
+    if not wide:  # whatever it is, it is told by its first line
         return _names(rows[0]), 1, (0,)
+    at = next((k for k in wide[:_TITLES] if _tell_readings(_names(rows[k]))), -1)
+    at = at if at >= 0 else _above_values(rows, wide)
     first = _names(rows[at])
     if _are_values(first):
         above = _names(rows[at - 1]) if at and _is_comment(rows[at - 1]) else [""]
         name = _MARK.sub("", above[0], count=1)
-        names = [name] * bool(name) + above[1:]  # the mark may stand in a cell of its own
+        names = [name] * bool(name) + above[1:]  # the mark, or a word for the names, may stand in a cell of its own
+        names = names[1:] if len(names) == len(first) + 1 else names
         if len(names) != len(first) or _are_values(names):
             return [NAMELESS.format(k + 1) for k in range(len(first))], at, ()
         return names, at, (at - 1,)
     units = _names(rows[at + 1]) if at + 1 < len(rows) else []
-    if any(map(str.isalpha, "".join(units))) and all(not text or is_unit(text) for text in units):
+    if any(is_unit(text) and text.strip("-1") for text in units) and not any(map(_NUMBER.fullmatch, units)):
         padded = zip(first, [*units, *[""] * len(first)], strict=False)
-        return [f"{name} [{unit}]" if unit else name for name, unit in padded], at + 2, (at, at + 1)
+        named = [f"{name} [{unit[1:-1] if unit[0] in '[(' else unit}]" if unit else name for name, unit in padded]
+        return named, at + 2, (at, at + 1)
     return first, at + 1, (at,)
+
+
+def _tell_readings(names: Sequence[str]) -> bool:
+    """Return whether names are those of columns with three readings."""
+    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= {"ax", "ay", "az"}
+
+
+def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:
+    """Return which of the wide rows is the last before a long run of values; the first where there is none."""
+    are_values = [_are_values(rows[k]) for k in wide]
+    for k in range(1, len(wide) - _RUN):
+        if not are_values[k - 1] and all(are_values[k : k + _RUN]):
+            return wide[k - 1]
+    return wide[0]
 
 
 def _are_values(cells: Sequence[str]) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS
 from kf_calib.sources.text.cells import LineError, stamp_ns, written
+from kf_calib.sources.text.heading import scalars, with_texts
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 
 _MARK = "\ufeff"  # some write it before the first line
@@ -27,11 +28,16 @@ POSE_KEYS = (*_ANGLES, _ATTITUDE)
 _TEMPERATURE = "temperature_c"
 _KNOWN = frozenset([*_TIME_NS, *_READINGS, *POSE_KEYS, _TEMPERATURE])
 
-_value_at = json.JSONDecoder().raw_decode
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
-_BETWEEN = " \t\r\n,:"
-"""What is between the names and the values of an object."""
 _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as this is rare, and may be two
+
+
+def are_ours(lines: Sequence[str], columns: Mapping[str, str]) -> bool:
+    """Whether lines of JSON have names of ours, or such as ``columns`` say are."""
+    theirs = [name for name, ours in columns.items() if ours in _KNOWN]
+    lists = "|".join(map(re.escape, (*_READINGS, *POSE_KEYS, *theirs)))
+    ours = re.compile(rf'"(?:bench|{lists})"\s*:\s*[\[{{]'), re.compile(r'"(?:bench|time_[num]?s)"\s*:')
+    return bool(theirs) or all(any(map(name.search, lines)) for name in ours)
 
 
 class JsonLines(LineReader):
@@ -52,10 +58,10 @@ class JsonLines(LineReader):
         entry = json.loads(line.lstrip(_MARK))
         theirs = {self._columns.get(key, key): key for key in entry}
         name = _first_of({ours: entry[key] for ours, key in theirs.items()}, _READINGS)
-        values = json.dumps([written(value / UNITS[_ACCEL.get(name, "m/s2")]) for value in readings_mps2])
-        (key_start, key_end), (start, end) = _spans(line)[theirs[name]]
-        key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
-        return line[:key_start] + key + line[key_end:start] + values + line[end:]
+        key, texts = theirs[name], [written(value / UNITS[_ACCEL.get(name, "m/s2")]) for value in readings_mps2]
+        places = {path: (start, end) for path, start, end in scalars(line)}
+        line = with_texts(line, [places[f"{key}.{k}"] for k in range(3)], dict(enumerate(map(repr, texts))))
+        return line if name in _ACCEL else re.sub(rf"{re.escape(json.dumps(key))}(?=\s*:)", '"accel_mps2"', line)
 
     def _row(self, line: str) -> SampleRow | None:
         line = line.lstrip(_MARK) if self._is_first else line
@@ -142,18 +148,6 @@ def _first_of(entry: Mapping[str, Any], names: Sequence[str]) -> str:
         if entry.get(name) is not None:
             return name
     return ""
-
-
-def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
-    """Where each key of an object stands in its line, with its quotes, and where its value does; the last of a name."""
-    spans, at = dict[str, tuple[tuple[int, int], tuple[int, int]]](), line.index("{") + 1
-    while line[at := len(line) - len(line[at:].lstrip(_BETWEEN))] != "}":
-        name, end = _value_at(line, at)
-        start = len(line) - len(line[end:].lstrip(_BETWEEN))
-        _, behind = _value_at(line, start)
-        spans[name] = (at, end), (start, behind)
-        at = behind
-    return spans
 
 
 def _numbers(values: Any, name: str) -> list[float]:

@@ -28,7 +28,7 @@ from kf_calib.sources.text.columns import HOW, Columns, refuse_unknown_names
 from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter, TextFile, holds_any
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
+from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines, are_ours
 from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
@@ -204,7 +204,7 @@ class Lines:
 
 def are_telling(lines: Sequence[str]) -> bool:
     """Whether these are enough of the first lines, of which the first is not blank, to choose a reader by."""
-    return len(lines) > _TELLING_ROWS or is_json(lines[0])
+    return len(lines) > _TELLING_ROWS or (is_json(lines[0]) and TextHeading.of_json(lines[:1]) is None)
 
 
 def reader_for(
@@ -216,8 +216,11 @@ def reader_for(
     lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. stated: of
     the columns, those that a header must have. Raises InputError for one that does not say what is needed.
     """
-    if is_json(lines[0]):
+    if is_json(lines[0]) and lines[0].lstrip(" \t\ufeff").startswith("["):
+        raise InputError("is one array of JSON: write an object a line, as jq -c '.[]' does.")
+    told = TextHeading.of_json(lines) if is_json(lines[0]) and not are_ours(lines, columns) else None
+    if is_json(lines[0]) and told is None:
         return JsonLines(columns, account, angles is not False), 0
-    heading = TextHeading.of(lines)
+    heading = told or TextHeading.of(lines)
     refuse_unknown_names(stated, heading.header)
     return CsvLines(Columns(heading, columns, units), account, angles), heading.lines

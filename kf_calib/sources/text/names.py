@@ -16,20 +16,35 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.support.units import WORDS
 
-ACCEL = {"m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "count": 1.0}
+ACCEL = {
+    "m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "cm/s2": 1e-2,
+    "ft/s2": 0.3048, "in/s2": 0.0254, "count": 1.0,
+}  # fmt: skip
 """Units of readings in m/s^2; counts as they are."""
 ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 TEMPERATURE = ("c", "k", "f")
 _UNITS = {
-    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻² м/с2 м/с^2 м/с² m_s2 m·s^-2 m·s-2",
-    "mm/s2": "mm/s2 mm/s^2 mm/s² mm/s**2 mm·s^-2",
-    "g": "g gn g0 g_n", "mg": "mg мg", "ug": "ug µg μg мкg",
+    "m/s2": "m/s2 m/s/s mps2 ms-2 м/с2 ms2", "mm/s2": "mm/s2 mms-2", "cm/s2": "cm/s2 cms-2 gal",
+    "ft/s2": "ft/s2 fts-2", "in/s2": "in/s2", "g": "g gn g0", "mg": "mg мg", "ug": "ug μg мкg",
     "count": "count counts lsb digit digits raw adc",
-    "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град град. ° º",
-    "s": "s sec second seconds sekunden с сек", "ms": "ms мс", "us": "us µs μs мкс", "ns": "ns", "min": "min мин",
-    "h": "h hours ч", "c": "°c ºc c degc deg_c celsius ℃ °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
+    "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град ° º",
+    "s": "s sec secs second seconds sekunde sekunden с сек",
+    "ms": "ms msec millis millisecond milliseconds мс",
+    "us": "us μs usec micros microsecond microseconds мкс",
+    "ns": "ns nsec nsecs nanosec nanosecond nanoseconds", "min": "min minute мин", "h": "h hour hours ч",
+    "c": "°c c degc degreesc celsius °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
 }  # fmt: skip
+"""As they are written, but for signs of powers and products."""
+_OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+_SHORTEST_TIME = 2
+"""Letters of a unit that is the name of a time; a shorter one may be a letter for something else."""
+
+
+def _unit_named(text: str) -> str:
+    """Return the unit that a text is; empty where it is none."""
+    plain = unicodedata.normalize("NFKC", text.replace("º", "°")).lower().replace("\u2212", "-")
+    return _OF_WORD.get(re.sub(r"[\s^*·⋅._()\[\]]", "", plain), "")
 
 
 def _plain(text: str) -> str:
@@ -42,21 +57,20 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(_plain(text).split())
 
 
-_OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
 _SPREAD = _words(
     "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen "
     "ско отклонение сигма разброс шум"
 )
 _FORCE = _words(
-    "a ac acc accl accel acceleration accelerometer accelerometers alpha beschleunigung beschl f force specific "
+    "a ac acc acce accl accel acceleration accelerometer accelerometers alpha beschleunigung beschl f force specific "
     "ускорение ускорения акселерометр"
 )
 _READING = _FORCE | _words(
     "reading readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output "
     "signal value wert raw среднее средние показание показания датчик канал значение сигнал"
 )
-_WITHOUT_GRAVITY = _words("linear free user gravity schwerkraft")
-"""Of two accelerations, that which is not the accelerometer's own: without gravity, or gravity alone."""
+_LESSER = _words("linear lin free user gravity schwerkraft raw")
+"""Of two accelerations, that which is not the accelerometer's own: without gravity, gravity alone, or in counts."""
 _GYROSCOPE = _words(
     "gyro gyr gy gx gz gyroscope gyroscopes angular omega velocity rate rates kreisel drehrate гироскоп гироскопа"
 )
@@ -66,7 +80,7 @@ _TRUTH = _words("true truth ref reference wahr soll expected истинное э
 _QUATERNION = _words("q quat quaternion quaternions кватернион")
 _ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
 _TIME = _words(
-    "time times zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
+    "time times ts zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
 )
 _LENGTH = _words("dwell duration dauer length lange длительность")
 _AXIS = _words("achse axis ось")
@@ -88,8 +102,8 @@ _RANKS = (
 _CHANNELS = frozenset("xyz123ху")
 _AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
 _RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)(?:\s*(?:/|p|per)\s*s|[\s·]*s\s*\^?-1)|dps")
-_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""From which size on a stamp without a unit is one since 1970 in this unit."""
+_OF_EPOCH = ((1e18, "ns"), (1e15, "us"), (1e12, "ms"))
+"""From which size on, and up to five times it, a stamp without a unit is one since 1970 in this unit: 2001 to 2128."""
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _LONGEST = 300  # characters of a name: it is looked at in many ways
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
@@ -113,14 +127,16 @@ class Meaning(NamedTuple):
 
 def is_unit(text: str) -> bool:
     """Whether a cell is nothing but a unit, or a dash."""
-    return text.strip("[]() ").lower() in _OF_WORD or text.strip() in ("-", "1")
+    return bool(_unit_named(text)) or text.strip() in ("-", "1")
 
 
 def meaning_of(name: str) -> Meaning:
     """What the name of a column says; nothing, where it is longer than any name."""
     name = name if len(name) <= _LONGEST else ""
-    told = _meaning_of(name)
-    return told if told.ours or told.other or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
+    channel = name.rpartition(":")[2]  # behind the name of its device
+    ways = map(_meaning_of, dict.fromkeys([channel, _CAMEL.sub(" ", channel), name, _CAMEL.sub(" ", name)]))
+    first = next((told for told in ways if told.ours or told.other), None)
+    return first or Meaning("", _unit_of(name.strip().lower())[1])
 
 
 def _meaning_of(name: str) -> Meaning:
@@ -144,7 +160,9 @@ def _meaning_of(name: str) -> Meaning:
         return Meaning(other="attitude")
     if words & _LENGTH:
         return Meaning("", unit)
-    if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
+    if (words & _TIME and (not unit or unit in TIME)) or (
+        unit in TIME and not (channel and (words or lowered[-1].isalpha()))  # X [s] is the horizontal axis of a plot
+    ):
         return Meaning("time", unit)
     if words & (_TEMPERATURE - {"t"}) or ("t" in words and unit in (*TEMPERATURE, "deg")) or unit == "c":
         return Meaning("temperature", unit if unit in TEMPERATURE else "")
@@ -183,7 +201,7 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
                 meanings[k] = Meaning(other="attitude")
     # of several columns taken for a reading, those count whose names say most that they are the accelerometer's
     strengths = [
-        (is_exact(name), not own & _WITHOUT_GRAVITY, bool(own & _FORCE)) for own, name in zip(words, names, strict=True)
+        (is_exact(name), not own & _LESSER, bool(own & _FORCE)) for own, name in zip(words, names, strict=True)
     ]
     for ours in ("ax", "ay", "az"):
         places = [k for k, own in enumerate(meanings) if own.ours == ours]
@@ -218,8 +236,9 @@ def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
 
 
 def unit_of_epoch(size: float) -> str:
-    """The unit of a stamp of that size that counts since 1970; empty where it is too small to."""
-    return next((unit for least, unit in _OF_EPOCH if size >= least), "")
+    """The unit of a stamp of that size that counts since 1970; empty where none of this size does, as none since a
+    device was started."""
+    return next((unit for least, unit in _OF_EPOCH if least <= size < 5.0 * least), "")
 
 
 def face_of(text: str) -> tuple[int, int] | None:
@@ -239,24 +258,26 @@ def _unit_of(name: str) -> tuple[str, str]:
 
     C, K and F are units of temperatures only, since channels have letters.
     """
-    match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
-    if match and (unit := _OF_WORD.get("·".join(match[2].split()))):
+    match = re.fullmatch(r"(.*?)\s*[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]", name)
+    if match and (unit := _unit_named(match[2])):
         return match[1], unit
     if match and match[2].isdigit():  # the number of a channel, which a unit may stand before
         text, unit = _unit_of(match[1])
         return f"{text}[{match[2]}]", unit
-    for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)[_ ](\S+)",
+    for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ .](\S+)", r"(.+?)[_ ](\S+)",
                     r"(.+?)\s*/\s*(\S+)"):  # fmt: skip
         match = re.fullmatch(pattern, name)
-        if match and match[2] in _OF_WORD and (match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1]))):
-            return match[1], _OF_WORD[match[2]]
-    return name, ""
+        unit = match and _unit_named(match[2])
+        if match and unit and (match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1]))):
+            return match[1], unit
+    unit = _unit_named(name) if len(name) >= _SHORTEST_TIME and name != "min" else ""
+    return name, unit if unit in TIME else ""
 
 
 def _tokens(text: str) -> list[str]:
     """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
     tokens = list[str]()
-    for word in re.findall(r"[a-zа-я]+|\d+", _plain(text)):
+    for word in re.findall(r"[a-z]+|[а-я]+|\d+", _plain(text)):
         stem, last = word[:-1], word[-1]
         known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _QUATERNION - {"q"})
         tokens += [stem, last] if known else [word]
@@ -276,14 +297,17 @@ def is_nameless(header: Sequence[str]) -> bool:
 
 def meanings_by_numbers(values: Floats) -> list[Meaning]:
     """What columns (n, k) are, NaN where a cell is no number: a first column that goes up is the time, the three beside
-    each other whose size changes least are the readings. No meaning where there are no such three."""
+    each other whose size changes least are the readings, of those that change. No meaning where there are no such
+    three."""
     meanings = [Meaning()] * values.shape[1]
     rises = len(values) > 1 and np.mean(np.diff(values[:, 0]) > 0.0) > _MOSTLY and values.shape[1] > 3
+    changes = np.array([len(np.unique(column)) > 1 for column in values.T])
+    never = not any(changes[k : k + 3].all() for k in range(int(rises), values.shape[1] - 2))
     spreads = dict[int, float]()
     for k in range(int(rises), values.shape[1] - 2):
         sizes = lengths(values[:, k : k + 3])
         sizes = sizes[np.isfinite(sizes)]
-        if len(sizes) and np.median(sizes) > 0.0:
+        if len(sizes) and np.median(sizes) > 0.0 and (never or changes[k : k + 3].all()):
             spreads[k] = float(np.quantile(np.abs(sizes - np.median(sizes)), _MOSTLY) / np.median(sizes))
     if not spreads:
         return meanings

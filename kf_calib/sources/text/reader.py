@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -74,8 +75,8 @@ def first_line(lines: Sequence[str]) -> int:
 
 
 def is_json(first: str) -> bool:
-    """Whether the first line that is not blank begins JSON lines."""
-    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+    """Whether the first line that is not blank begins JSON lines, or one array of objects."""
+    return re.match(r"\ufeff?\s*(\{|\[\s*(\{|$))", first) is not None
 
 
 class Described:

@@ -181,6 +181,8 @@ def _merged(content: bytes) -> int:
 def _unreadable(path: Path, error: Exception) -> InputError:
     """Return the error for what openpyxl raises for a damaged file, which depends on where the damage is."""
     cause = error.__cause__ or error  # openpyxl says it again, with the name of the archive
+    if isinstance(error, KeyError):  # of a part that any spreadsheet has
+        return InputError(f"{path}: is an archive of files: unpack it, and give the one with the readings.")
     said = cut(" ".join(str(cause).split()), 80) or type(cause).__name__
     return InputError(f"{path}: is no Excel file that can be read ({said}): save it again.")
 
