@@ -186,15 +186,15 @@ def test_nothing_lies_beside_the_packages() -> None:
 
 CEILINGS = {
     "kf_calib": 188,
-    "support": 1066,
-    "bench": 1704,
-    "effects": 3038,
-    "sources": 11824,
-    "dwells": 3805,
-    "noise": 3381,
-    "estimation": 7861,
+    "support": 1071,
+    "bench": 1706,
+    "effects": 3129,
+    "sources": 11823,
+    "dwells": 3809,
+    "noise": 3377,
+    "estimation": 7857,
     "design": 1875,
-    "diagnosis": 5672,
+    "diagnosis": 5719,
     "online": 1617,
     "exchange": 1962,
     "views": 6976,
@@ -202,7 +202,7 @@ CEILINGS = {
     "report": 781,
     "bags": 403,
     "certificate": 1504,
-    "exports": 1149,
+    "exports": 1151,
     "fleet": 4258,
     "logs": 365,
     "positioning": 1963,
@@ -212,8 +212,9 @@ CEILINGS = {
 (by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
 beside other terms; that of diagnosis four times more, for causes that nobody knows beside stated noise, for what one
 accelerometer alone has, for the readings within dwells beside what is fitted, and for what goes with time wherever a
-bench may err. That of sources was raised for logs in layouts that their loggers chose. Those of bench and support were
-raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels."""
+bench may err; and with effects for what lags behind anything and the way that gimbals turn. That of sources was raised
+for logs in layouts that their loggers chose. Those of bench, support and dwells were raised for numbers that several
+rooms had each for itself: of rounding, memory, searches and levels."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 
