@@ -310,12 +310,16 @@ class RunPosterior:
         return likelihood.spanned.beside(np.arange(len(likeliest)), likelihood.lengths), courses
 
     def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:
-        """Return a row with dwells that are off beside what it has, which is in the model of ``rows``."""
+        """Return a row with dwells that are off beside what it has, which is in the model of ``rows``.
+
+        What they gain beside an unknown function counts in part: what this leaves is larger in some dwells.
+        """
         noises = self._sizes.in_families(partial(InNoises, rows))
         found = DwellsApart(rows, courses, noises, self._sizes).rows_of_dwells()
         log, places = max(found, default=(-math.inf, ()))
         without = self._sizes.evidence(np.concatenate([of_family.logs for of_family in noises])[None])[0]
         gain = log - float(np.logaddexp.reduce(without))
+        gain = min(gain, INDEPENDENT * gain) if row.driver else gain
         return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
 
     def _number(self, row: Hypothesis) -> int | None:

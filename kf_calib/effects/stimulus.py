@@ -404,8 +404,10 @@ class Stimulus:
     @cached_property
     def gimbal_axes(self) -> Floats:
         """The axis of each gimbal seen in the platform, (m, k, 3)."""
-        axes = [self.inner(np.array(axis), k) for k, axis in enumerate(self.bench.axes)]
-        return np.stack(axes, axis=1)
+        axes = np.zeros((len(self), len(self.bench.axes), 3))
+        for k, axis in enumerate(self.bench.axes):
+            axes[:, k] = self.inner(np.array(axis), k)
+        return axes
 
     def to_platform(self, vector: Floats) -> Floats:
         """A bench vector (3,) seen in the platform, (m, 3)."""
