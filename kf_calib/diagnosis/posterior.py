@@ -85,7 +85,7 @@ class RunPosterior:
         self._run = RunTerms(before, self._noise, self._least_mps2, test, self._with_constants())
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
-        self._no_oscillation = set[str]()
+        self._refused = set[str]()
         self._of_refits = dict[tuple[str, ...], tuple[RunLikelihood, Floats, Floats, Floats]]()
 
     def table(self, refitted: bool = True) -> HypothesisTable:
@@ -453,25 +453,27 @@ class RunPosterior:
         single = [row for row in single if self._effects[row.effects[0]].scannable]
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
-        fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
+        fitted = self._without_refused([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while more := _to_be_fitted(fitted):
-            fitted = self._steady([self._refitted(row) if id(row) in more else row for row in fitted])
+            fitted = self._without_refused([self._refitted(row) if id(row) in more else row for row in fitted])
         first = max(fitted, key=lambda row: row.log_evidence)
         least = first.log_evidence + math.log(LISTED)  # others are not shown
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
-    def _steady(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the rows without an oscillation that does not go on alike in all dwells."""
-        return [row for row in rows if not self._no_oscillation & {*row.effects}]
+    def _without_refused(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the rows without an effect that its fit has refused: one with which the run tells nothing, or an
+        oscillation that does not go on alike in all dwells."""
+        return [row for row in rows if not self._refused & {*row.effects}]
 
     def _refitted(self, row: Hypothesis) -> Hypothesis:
         """Return a row of effects with its fit, weighed there unless dwells were folded otherwise for it."""
         try:
             refit = self._refits.with_effects(self._before, row.effects)
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
+            self._refused |= {*row.effects} if len(row.effects) == 1 else set()
             return replace(row, log_evidence=-math.inf)
         if refit.model.oscillates and not self._before.model.oscillates and p_of_steady_oscillation(refit.fit) < CLEAR:
-            self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
+            self._refused |= {str(effect) for effect in refit.model.effects if effect.oscillates}
             return row
         folded, before = refit.fit.dwells.folded, self._before.fit.dwells.folded
         otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
@@ -590,12 +592,13 @@ class RunPosterior:
 
 def _to_be_fitted(rows: Sequence[Hypothesis]) -> set[int]:
     """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
-    beside effects, of the likeliest pairs of these: beside each other, constants are others than alone."""
+    beside effects, of these alone and of their likeliest pairs: beside each other, constants are others than alone."""
     first, *others = sorted(rows, key=lambda row: -row.log_evidence)
     likeliest = [first]
     if first.driver:
-        with_more = [row for row in others if not row.driver and {*first.effects} < {*row.effects}]
-        likeliest = with_more[:_BESIDE] if first.effects else []
+        known = [row for row in others if first.effects and not row.driver]
+        with_more = [row for row in known if {*first.effects} < {*row.effects}][:_BESIDE]
+        likeliest = [*(row for row in known if {*row.effects} == {*first.effects}), *with_more]
     return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
 

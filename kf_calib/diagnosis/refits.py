@@ -14,7 +14,7 @@ from kf_calib.bench.streams import Source, Table
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates
 from kf_calib.effects import oscillation_of
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.estimation.calibration import calibrate, evaluate_fit
+from kf_calib.estimation.calibration import calibrate, evaluate_fit, refuse_unseen
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
@@ -94,7 +94,9 @@ class Refits:
             fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews, must_settle=False, beginning=beginning)
             if self.source is not None and not holds_its_oscillation(fitted):
                 return calibrate(self.source, settings, plain=None if dwells.folded.averaged else fitted)
-            return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+            refitted = replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+            refuse_unseen(refitted)
+            return refitted
 
 
 def calibration_of(
