@@ -278,7 +278,7 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
         courses = [(way,), *(tuple(lost[k : k + 3]) for k in range(max(len(lost) - 2, 1)))]
         for place in (place for place in places if place.lively):
             where = f" ({place.words})" if place.words else ""
-            yield _one_of(f"way of {words}{where}", "temperature", [place.of(course) for course in courses])
+            yield _one_of(f"way of {words}{where}", place.family, [place.of(course) for course in courses])
 
 
 def _of_history(gimbals: int, dwells: Sequence[Dwell], slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
