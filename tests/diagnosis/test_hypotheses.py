@@ -208,8 +208,11 @@ def test_what_an_effect_leaves_is_tested_in_the_noise_that_it_leaves() -> None:
     assert again.consistency.consistent is False
 
 
-def test_a_constant_that_the_run_does_not_tell_is_no_value_to_be_weighed(tmp_path: Path) -> None:
+def test_a_constant_that_the_run_does_not_tell_is_no_value_to_be_weighed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To a jump a play is fitted that is wider than the swing of the temperature: it has no sigma."""
+    monkeypatch.chdir(tmp_path)  # the plan of the trial goes there
     task = Task("outside@15", "outside", 5151510500017, ("bias-jump=15sigma",), (), "0.0002")
     simulate_trial(task, tmp_path / "run.mcap")
     found = diagnose(Recording(tmp_path / "run.mcap"), replicate=False)
