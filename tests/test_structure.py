@@ -194,7 +194,7 @@ CEILINGS = {
     "noise": 3377,
     "estimation": 7857,
     "design": 1875,
-    "diagnosis": 5728,
+    "diagnosis": 5730,
     "online": 1617,
     "exchange": 1962,
     "views": 6976,

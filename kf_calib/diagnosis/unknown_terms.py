@@ -22,6 +22,7 @@ _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
 """Of one cause that are tried: moments of a jump, orientations to which something comes back."""
+_MOST_DECAYING = 32  # moments of a jump that decays: each has the columns of four decays
 _SHARES = {1: 0.5, 2: 0.25, 0: 0.25}
 """Of one, two and all of the summands of an unknown function."""
 
@@ -246,7 +247,8 @@ def _of_jumps(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unk
     bends = [f"(t > {s:.6g}*s)*(t-{s:.6g}*s)" for s in inner_s]
     rates = [("t", *both) for both in itertools.pairwise(bends)] or [("t", *bends)]
     decaying = "(t > {0:.6g}*s)*exp(-abs(t-{0:.6g}*s)/({1}*s))"
-    decays = [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in between_s]
+    few_s = between_s[:: len(between_s) // _MOST_DECAYING + 1]
+    decays = [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in few_s]
     for place in places:
         steps = [(f"(t > {s:.6g}*s)",) for s in (between_s if place.words else moments_s)]
         yield replace(place.one_of("a jump", steps), at_once=2)

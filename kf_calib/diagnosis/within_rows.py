@@ -19,7 +19,7 @@ from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
-_TALL = 4  # times as many rows as columns are kept before they are reduced
+_TALL = 2  # times as many rows as columns are kept before they are reduced
 _CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
 _ANY_SIZE = np.geomspace(0.1, 1e5, 61)  # of what disturbs a dwell, in units of the noise
 
