@@ -470,7 +470,8 @@ class RunPosterior:
         try:
             refit = self._refits.with_effects(self._before, row.effects)
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
-            self._refused |= {*row.effects} if len(row.effects) == 1 else set()
+            if len(row.effects) == 1:
+                self._refused.add(row.effects[0])
             return replace(row, log_evidence=-math.inf)
         if refit.model.oscillates and not self._before.model.oscillates and p_of_steady_oscillation(refit.fit) < CLEAR:
             self._refused |= {str(effect) for effect in refit.model.effects if effect.oscillates}

@@ -29,7 +29,7 @@ _SHARES = {1: 0.5, 2: 0.25, 0: 0.25}
 _SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
 _CAGE = 0.4  # turns of the cage of a bearing in one of the gimbal
 _END = 0.125  # of a run
-_OF_TWO = ("a*a", "p*p", "a*p", "a*o", "p*o", "abs(a)")  # of the force, that change with time or temperature
+_CURVED = ("a*a", "p*p", "a*p", "a*o", "p*o", "abs(a)")  # functions of the force that are not straight
 _LEVELS = (1, 2, 3, 4, 5, 6, 7, 8, 9)  # of the force at which a sensor may behave otherwise, in tenths of gravity
 _TURNS = 12  # of what oscillates, in a run, at most
 
@@ -180,10 +180,25 @@ def _waves(angle: str) -> tuple[str, str]:
     return f"sin({angle})", f"cos({angle})"
 
 
-def _decays(time: str, least_s: int, longest_s: float) -> list[tuple[str, ...]]:
-    """Decays of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
-    texts = [f"exp(-{time}/({least_s * k}*s))" for k in _DECAYS if k == 1 or least_s * k <= longest_s]
+def _constants_s(least_s: int, longest_s: float) -> list[int]:
+    """Time constants that are tried, the least in any case."""
+    return [least_s * k for k in _DECAYS if k == 1 or least_s * k <= longest_s]
+
+
+def _of_three(texts: Sequence[str]) -> list[tuple[str, ...]]:
+    """Functions of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
     return [tuple(texts[k : k + 3]) for k in range(max(len(texts) - 2, 1))]
+
+
+def _decays(time: str, least_s: int, longest_s: float) -> list[tuple[str, ...]]:
+    """Decays of any time constant."""
+    return _of_three([f"exp(-{time}/({tau_s}*s))" for tau_s in _constants_s(least_s, longest_s)])
+
+
+def _with_forces(symbol: str) -> list[str]:
+    """Products of a quantity, and of its square, with functions of the force."""
+    powers = (symbol, f"{symbol}*{symbol}")
+    return [f"{power}*{force}" for forces in (("a", "p", "o"), _CURVED) for power in powers for force in forces]
 
 
 def _times(texts: Sequence[str], force: str) -> tuple[str, ...]:
@@ -214,14 +229,12 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
     texts = ["t", "t*t", *(f"cos({n}*pi*t/{run_s})" for n in range(1, 9))]
     weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
     yield _term("time", "bias in time", texts, weights)
-    products = [f"{power}*{force}" for power in ("t", "t*t") for force in ("a", "p", "o")]
-    products += [f"{power}*{force}" for power in ("t", "t*t") for force in _OF_TWO]
-    products += [f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7)]
+    products = [*_with_forces("t"), *(f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7))]
     yield _term("time and specific force", "scale in time", products)
     for place in (place for place in places if place.turns):
         yield _term(f"time ({place.words})", place.family, [text for t in texts[:6] for text in place.of([t])], weights)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
-    creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *(10 * k for k in _DECAYS if 10 * k <= dwells[-1].end_s))]
+    creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *_constants_s(10, dwells[-1].end_s))]
     # between neighbouring frequencies all are sums of these
     waves = {n: _waves(f"{n}*pi*t/{run_s}") for n in range(1, 2 * min(_TURNS, len(dwells) // 2) + 2)}
     oscillations = [(*waves[n - 1], *waves[n], *waves[n + 1]) for n in range(2, len(waves), 2)]
@@ -274,10 +287,9 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
     ways = [(f"gimbal {k}", f"q{k}_way") for k in range(1, gimbals + 1)]
     if gimbals > 1:
         ways.append(("all gimbals", f"({'+'.join(way for _, way in ways)})"))
-    constants_s = [10 * k for k in _DECAYS if 10 * k <= 10.0 * dwells[-1].end_s]
+    constants_s = _constants_s(10, 10.0 * dwells[-1].end_s)
     for words, way in ways:
-        lost = [f"({way}-lag({way},{tau_s}*s))" for tau_s in constants_s]
-        courses = [(way,), *(tuple(lost[k : k + 3]) for k in range(max(len(lost) - 2, 1)))]
+        courses = [(way,), *_of_three([f"({way}-lag({way},{tau_s}*s))" for tau_s in constants_s])]
         for place in (place for place in places if place.lively):
             where = f" ({place.words})" if place.words else ""
             yield _one_of(f"way of {words}{where}", place.family, [place.of(course) for course in courses])
@@ -286,7 +298,7 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
 def _of_history(gimbals: int, dwells: Sequence[Dwell], slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
     """What follows the force across, an angle or the temperature with a time constant: between two all others are sums
     of both."""
-    constants_s = [10 * k for k in _DECAYS if k == 1 or 10 * k <= dwells[-1].end_s]
+    constants_s = _constants_s(10, dwells[-1].end_s)
     between = [*itertools.pairwise(constants_s)] or [(constants_s[0],)]
 
     def lagging(*quantities: str, times: str = "") -> list[tuple[str, ...]]:
@@ -305,9 +317,7 @@ def _of_history(gimbals: int, dwells: Sequence[Dwell], slow: Sequence[tuple[str,
 
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("temperature", "temperature", ["T", "T*T", "T**3"])
-    products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
-    products += [f"{power}*{force}" for power in ("T", "T*T") for force in _OF_TWO]
-    yield _term("temperature and specific force", "temperature", products)
+    yield _term("temperature and specific force", "temperature", _with_forces("T"))
     yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):

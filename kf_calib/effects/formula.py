@@ -33,7 +33,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -85,15 +85,11 @@ class Reading:
 
     def __call__(self, s: Stimulus) -> Floats:
         """Values (m, 1) or (m, 3)."""
-        if not self.expression.lags:
-            return self._values(s, VALUES)
-        whole, key = s if s.whole is None else s.whole, ("formula", self.expression.text)
-        if whole.whole is not None:
-            return self(whole)[s.places]
-        if key not in whole.known:
-            course, places = whole.with_ways
-            whole.known[key] = self._values(course, VALUES | {LAG: self._lag(course)})[places]
-        return whole.known[key][s.places]
+        return s.of_course(self._in_course) if self.expression.lags else self._values(s, VALUES)
+
+    def _in_course(self, course: Stimulus) -> Floats:
+        """Return values where all instants of a run are in order of time."""
+        return self._values(course, VALUES | {LAG: partial(self._lag, course)})
 
     def _values(self, s: Stimulus, functions: dict[str, Callable[..., Any]]) -> Floats:
         """Return values (m, 1) or (m, 3), with these functions."""
@@ -101,16 +97,12 @@ class Reading:
         values = self.expression(names, functions=functions)
         return np.array(np.broadcast_to(values, (len(s), np.shape(values)[-1] if np.ndim(values) else 1)), dtype=float)
 
-    def _lag(self, s: Stimulus) -> Callable[[Floats | float, Floats | float], Floats]:
-        """Return what ``lag`` is in a run; it raises InputError where its time constant is none."""
-
-        def lag(values: Floats | float, tau_s: Floats | float) -> Floats:
-            constants = np.unique(tau_s)
-            if not (len(constants) == 1 and 0.0 < constants[0] < np.inf):
-                raise InputError(f"{self.name}: {LAG} needs one time constant above 0, as in {LAG}(T, 60*s).")
-            return s.lag(values, float(constants[0]))
-
-        return lag
+    def _lag(self, course: Stimulus, values: Floats | float, tau_s: Floats | float) -> Floats:
+        """Return what follows values in a run; raises InputError where the time constant is none."""
+        constants = np.unique(tau_s)
+        if not (len(constants) == 1 and 0.0 < constants[0] < np.inf):
+            raise InputError(f"{self.name}: {LAG} needs one time constant above 0, as in {LAG}(T, 60*s).")
+        return course.lag(values, float(constants[0]))
 
     @property
     def units(self) -> dict[str, str]:

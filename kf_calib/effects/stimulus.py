@@ -345,8 +345,13 @@ class Stimulus:
     @_of_the_whole
     def remembered(self, tau_s: float) -> Floats:
         """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first."""
+        return self.of_course(lambda course: course.lag(course.along, tau_s))
+
+    @_of_the_whole
+    def of_course(self, values: Callable[[Stimulus], Floats]) -> Floats:
+        """Values (m, n) of a function of the whole run in order of time (``with_ways``), at the instants of this."""
         course, places = self.with_ways
-        return course.lag(course.along, tau_s)[places]
+        return values(course)[places]
 
     @cached_property
     def with_ways(self) -> tuple[Stimulus, Indices]:
@@ -359,13 +364,14 @@ class Stimulus:
         parts = [self.at_instants(order), *(
             leaving.on_way_to(arriving, arrived_s, share) for share in np.arange(1, _ON_WAY + 1) / _ON_WAY
         )]  # fmt: skip
-        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COURSE}
+        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COURSE}
         all_s = joined["elapsed_s"]
         in_time = np.lexsort((np.arange(len(all_s)) < len(order), all_s))  # at the same time the way comes first
         rank, places = np.empty(len(all_s), np.intp), np.empty(len(order), np.intp)
         rank[in_time] = np.arange(len(all_s))
         places[order] = rank[: len(order)]
-        course = replace(self.at_instants(order[:1]), **{name: values[in_time] for name, values in joined.items()})
+        course = Stimulus(self.bench, sensitivity=self.sensitivity,
+                          **{name: values[in_time] for name, values in joined.items()})  # fmt: skip
         vars(course)["warming"] = np.interp(course.elapsed_s, self.elapsed_s[order], self.warming[order])
         return course, places
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from helpers.independent_bench import DWELL_S, HZ, SLEW_S, Error, IndependentBench, State
+from scipy.signal import lfilter
 
 from kf_calib.bench.arrays import Floats
 
@@ -89,13 +90,10 @@ def _way(at: State) -> Floats:
 
 
 def _motors(at: State, rng: np.random.Generator) -> Floats:
-    """The warmth of the motors: each turn adds to it, and it goes, step by step."""
+    """The warmth of the motors: each turn adds to it, and a share of it goes with each step of time."""
     way = _way(at) @ rng.uniform(0.2, 1.0, 3)
-    lost = np.exp(-np.diff(at.time_s) / (at.time_s[-1] * rng.uniform(0.05, 0.3)))
-    warmth = np.zeros(len(way))
-    for k, (kept, added) in enumerate(zip(lost, np.diff(way), strict=True), start=1):
-        warmth[k] = kept * warmth[k - 1] + added
-    return warmth
+    kept = float(np.exp(-at.time_s[1] / (at.time_s[-1] * rng.uniform(0.05, 0.3))))
+    return lfilter([1.0], [1.0, -kept], np.diff(way, prepend=way[:1]))
 
 
 FAULTS: dict[str, tuple[str, Course]] = {

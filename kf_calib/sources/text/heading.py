@@ -83,11 +83,9 @@ class TextHeading(NamedTuple):
         found = [{path: line[start:end] for path, start, end in scalars(line)} for line in lines[:_ROWS]]
         header = list(dict.fromkeys(path for cells in found for path in cells if path))
         rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
-        return (
-            cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows)))
-            if len(header) >= _FEWEST_CELLS
-            else None
-        )
+        if len(header) < _FEWEST_CELLS:
+            return None
+        return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows)))
 
     @classmethod
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
@@ -189,10 +187,8 @@ def _labelled_in(line: str) -> tuple[list[str], list[str], list[tuple[int, int]]
     spans = [match.span() for match in _IN_TEXT.finditer(line)] if len(line) < _LONGEST_LABELLED else []
     labels, units, end = list[str](), list[str](), 0
     for (start, behind), (after, _) in pairwise([*spans, (len(line), 0)]):
-        label, unit = (
-            _LABEL.search(line[max(end, start - _LONGEST_LABEL) : start]),
-            _UNIT_BEHIND.match(line, behind, after),
-        )
+        label = _LABEL.search(line[max(end, start - _LONGEST_LABEL) : start])
+        unit = _UNIT_BEHIND.match(line, behind, after)
         labels.append(label[1] if label else "")
         units.append(unit[1] if unit and is_unit(unit[1]) else "")
         end = unit.end() if unit and units[-1] else behind
