@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import IN_CACHE, Floats
 from kf_calib.diagnosis.hypothesis_table import PRIOR
 from kf_calib.diagnosis.in_noises import InNoises, Spanned
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
@@ -65,5 +65,10 @@ class DwellsApart:
     def _log_bayes(self, without: Sequence[int]) -> Floats:
         """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells without some of them tell."""
         changes = self.courses.log_bayes(math.exp(self._log_prior))
-        means = [log_bayes_of_any_size(*of_family.dwells(self.rows, without)) for of_family in self.noises]
+        most = max(IN_CACHE // (8 * len(self.rows)), 1)  # sizes of noise at once
+        means = [
+            log_bayes_of_any_size(*of_family.dwells(self.rows, without, slice(k, k + most)))
+            for of_family in self.noises
+            for k in range(0, len(of_family), most)
+        ]
         return np.concatenate(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)

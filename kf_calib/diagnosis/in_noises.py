@@ -23,6 +23,7 @@ from kf_calib.estimation.candidate_scan import SEEN
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
+_EVERY = slice(None)
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -119,16 +120,19 @@ class InNoises:
         off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
         return gram - np.swapaxes(off, 2, 3) @ off, lengths
 
-    def dwells(self, rows: Spanned, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
+    def __len__(self) -> int:
+        return len(self.logs)
+
+    def dwells(self, rows: Spanned, without: Sequence[int] = (), sizes: slice = _EVERY) -> tuple[Floats, Floats]:
         """G^T W G (K, D, 3, 3) and G^T W z (K, D, 3) of offsets of the three accelerometers in one dwell, as the others
-        tell, without some of them.
+        tell, without some of them, in some of the sizes.
 
         rows: of the run, with or without columns that are in the model. Raises LinAlgError where the other dwells do
         not determine it.
         """
         kept = np.ones((len(rows), 1, 1))
         kept[list(without)] = 0.0
-        weights = self._turns @ (self._weights[..., None] * np.swapaxes(self._turns, 1, 2))
+        weights = self._turns @ (self._weights[sizes, ..., None] * np.swapaxes(self._turns, 1, 2))
         weighted, more = weights @ rows.basis, rows.more_basis.T @ rows.more_basis
         lower = np.linalg.cholesky(_summed(rows.basis * kept, weighted) + more)
         whole = np.linalg.cholesky(_summed(rows.basis, weighted) + more) if len(without) else lower

@@ -99,7 +99,7 @@ class RunLikelihood:
         of_prior = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
         self._states = design.shape[2]
         z = (self._root @ readings[..., None])[..., 0]
-        columns, within = self._made(effects, known, blocks)
+        columns, within = self._made(effects, known, blocks, z, spanned(np.vstack(self._root @ design))[0])
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
@@ -114,23 +114,32 @@ class RunLikelihood:
         """Number of rows of means."""
         return self.spanned.readings.size
 
-    def _made(self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination]) -> tuple[Floats, WithinRows]:
+    def _made(
+        self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination], z: Floats, basis: Floats
+    ) -> tuple[Floats, WithinRows]:
         """Return the columns (D, 3, C) of all terms in the means, and rows within dwells, made for a few dwells at a
-        time: their values at all nodes take ten times the memory."""
+        time: their values at all nodes take ten times the memory. z (D, 3): what the model leaves of the means; basis
+        (3 D, r): what it spans."""
         linearised, dwells = self.linearised, self.linearised.dwells_at_state
         model, state = linearised.model, linearised.state
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
         columns = np.empty((len(dwells), 3, count))
-        within = WithinRows(self.noise, linearised, known, np.append(state, np.zeros(made)))
+        # chi-squared of the means beyond its expectation, and no less than noise makes of it
+        explained = max(float(np.sum(z**2)) - z.size, 0.0) + 3.0 * math.sqrt(2.0 * z.size)
+        within = WithinRows(self.noise, linearised, known, np.append(state, np.zeros(made)), explained)
+        squares = np.zeros(model.count - known + made)
+        along = np.zeros((basis.shape[1], len(squares)))
         for few, some, pieces, nodes in few_at_a_time(dwells, stimulus, made):
             added = candidate_columns(some, effects, model.bench, state, nodes)
             of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
             of_terms = of_states.beside(added) if known < model.count else added
-            _combine(means_of(some, of_terms).design, blocks, columns[few])
-            columns[few] = self._root[few] @ columns[few]
-            within.add(some, values[pieces], added.values, pieces)
+            design = self._root[few] @ means_of(some, of_terms).design
+            _combine(design, blocks, columns[few])
+            along += basis[3 * few.start : 3 * few.stop].T @ np.vstack(design)
+            squares += np.einsum("dic,dic->c", design, design)
+            within.add(some, values[pieces], added.values, pieces, np.maximum(squares - np.sum(along**2, axis=0), 0.0))
         return columns, within
 
     def courses_at(self, state: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE) -> Courses:
@@ -187,7 +196,7 @@ class RunLikelihood:
         log -= float(np.log(np.abs(np.diag(upper))).sum())
         columns, z = columns - basis @ (basis.T @ columns), z - basis @ (basis.T @ z)
         if len(flat):
-            left = _directions(columns[:, np.searchsorted(places, flat)])
+            left = spanned(columns[:, np.searchsorted(places, flat)], SEEN)[0]
             columns, z = columns - left @ (left.T @ columns), z - left @ (left.T @ z)
         return Projected(places, columns, z[:, 0], log - 0.5 * float(z[:, 0] @ z[:, 0]))
 
@@ -215,13 +224,6 @@ class RunLikelihood:
         covariances = FREE[kind].shapes(self.means, self.linearised.state).sum(axis=0)
         shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
         return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
-
-
-def _directions(columns: Floats) -> Floats:
-    """Return an orthonormal basis (r, f) of columns (r, q), without what is none but for rounding."""
-    lengths = np.linalg.norm(columns, axis=0)
-    left, singular, _ = np.linalg.svd(columns / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-    return np.asarray(left[:, singular > SEEN], float)
 
 
 def _width(block: Combination) -> int:

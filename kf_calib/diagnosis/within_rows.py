@@ -21,6 +21,7 @@ from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _TALL = 2  # times as many rows as columns are kept before they are reduced
 _CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
+_UNSEEN = 0.01  # chi-squared within dwells of a coefficient as large as the means allow, below which it has no rows
 _ANY_SIZE = np.geomspace(0.1, 1e5, 61)  # of what disturbs a dwell, in units of the noise
 
 
@@ -71,10 +72,13 @@ class WithinRows:
     """The rows within dwells, gathered a few dwells at a time.
 
     noise: what was stated. linearised: the dwells with the columns of the model, of which the first ``known`` have a
-    flat prior. about (p + made,): the state of the model, and coefficients of the columns of effects.
+    flat prior. about (p + made,): the state of the model, and coefficients of the columns of effects. explained: by how
+    much these lower chi-squared of the means at most.
     """
 
-    def __init__(self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats) -> None:
+    def __init__(
+        self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats, explained: float = math.inf
+    ) -> None:
         self._model, self._state, self._known = linearised.model, linearised.state, known
         self._made = len(about) - self._model.count
         judging = noise.with_scatter_as_flicker(len(linearised.dwells)).without(RandomWalk)
@@ -83,7 +87,8 @@ class WithinRows:
         self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
         self._channels = 1 if noise.attitude_unknown else 3
         self._about = np.append(about, np.zeros(self._shared.shape[3]))
-        self._largest = np.zeros(len(self._about))
+        self._largest, self._unseen = np.zeros(len(self._about)), np.zeros(len(self._about) + 1)
+        self._share = _UNSEEN / explained
         self._gathered = list[tuple[Floats, Indices]]()
         self._courses = list[Floats]()
         self.log = 0.0
@@ -94,9 +99,14 @@ class WithinRows:
         """What the model leaves of the course of each dwell."""
         return Courses(*np.concatenate(self._courses, axis=1))
 
-    def add(self, dwells: DwellTable, of_model: Floats, of_effects: Floats, pieces: slice) -> None:
+    def add(self, dwells: DwellTable, of_model: Floats, of_effects: Floats, pieces: slice,
+            of_means: Floats | float = 0.0) -> None:  # fmt: skip
         """Add a few dwells with their columns (P, K, 3, p) of the model and (P, K, 3, made) of effects; pieces: which
-        of the run they have. Columns that do not change within dwells have no rows."""
+        of the run they have. Columns that do not change within dwells have no rows.
+
+        of_means: squares of the terms' columns in the means so far. What the means tell of a coefficient bounds it, and
+        where it then is not seen within dwells its column has no rows either.
+        """
         if not self._noise.within_seen:
             self._courses.append(np.zeros((4, len(dwells))))
             return
@@ -114,7 +124,8 @@ class WithinRows:
         pairs = [(rows[:, -1], rows[:, -1 - len(made) : -1] @ made) for rows in of_dwells]
         products = np.array([(left @ left, left @ course, course @ course) for left, course in pairs]).T
         self._courses.append(np.stack([products[0], np.asarray(freedom, float), *products[1:]]))
-        self._gathered.append((_reduced(np.concatenate(of_dwells)), np.append(np.flatnonzero(moving), len(moving))))
+        self._unseen[self._known : self._model.count + self._made] = self._share * of_means
+        self._gathered.append(self._reduced(np.concatenate(of_dwells), np.append(np.flatnonzero(moving), len(moving))))
         if sum(len(rows) for rows, _ in self._gathered) > _TALL * max(rows.shape[1] for rows, _ in self._gathered):
             self._gathered = [self._merged()]
 
@@ -143,12 +154,14 @@ class WithinRows:
         for rows, columns in self._gathered:
             stacked[first : first + len(rows), np.searchsorted(moving, columns)] = rows
             first += len(rows)
-        return _reduced(stacked), moving
+        return self._reduced(stacked, moving)
 
-
-def _reduced(rows: Floats) -> Floats:
-    """Return rows (m, n), or no more of them than there are columns, with the same products."""
-    return triangle(rows) if len(rows) > rows.shape[1] else rows
+    def _reduced(self, rows: Floats, columns: Indices) -> tuple[Floats, Indices]:
+        """Return rows (m, n) of the columns that are seen within dwells, no more than there are columns, with the same
+        products."""
+        seen = np.einsum("rc,rc->c", rows, rows) > self._unseen[columns]
+        rows = rows[:, seen]
+        return (triangle(rows) if len(rows) > rows.shape[1] else rows), columns[seen]
 
 
 def _changing(values: Floats, ends: Indices, largest: Floats) -> Mask:

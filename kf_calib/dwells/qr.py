@@ -71,15 +71,16 @@ def multiplied(rows: Floats, matrix: Floats) -> Floats:
     return product
 
 
-def spanned(columns: Floats) -> tuple[Floats, Floats, float]:
+def spanned(columns: Floats, least: float = 1e-9) -> tuple[Floats, Floats, float]:
     """What columns (m, n) span: an orthonormal basis (m, r), the matrix (n, r) from its coefficients to theirs, and the
-    logarithm of their volume; rounding counts as nothing. To save memory, the columns are overwritten."""
+    logarithm of their volume; what is less than a share ``least``, as rounding is, counts as nothing. To save memory,
+    the columns are overwritten."""
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     columns /= lengths
     rows, upper = orthonormal(columns)
     turn, singular, right = np.linalg.svd(upper, full_matrices=False)
-    seen = singular > 1e-9 * singular.max(initial=0.0)
+    seen = singular > least * singular.max(initial=0.0)
     log_volume = float(np.log(singular[seen]).sum() + np.log(lengths).sum())
     return multiplied(rows, turn[:, seen]), right[seen].T / singular[seen] / lengths[:, None], log_volume
 
