@@ -191,8 +191,8 @@ class RunLikelihood:
             parts = [np.linalg.inv(lower) @ part for part in parts]
             log -= float(np.log(np.einsum("dii->di", lower)).sum())
         more = [rows.more_basis, rows.more_columns[:, places], rows.more_readings[:, None]]
-        spanned, columns, z = (np.vstack([p.reshape(-1, p.shape[2]), m]) for p, m in zip(parts, more, strict=True))
-        basis, upper = np.linalg.qr(spanned)
+        model, columns, z = (np.vstack([p.reshape(-1, p.shape[2]), m]) for p, m in zip(parts, more, strict=True))
+        basis, upper = np.linalg.qr(model)
         log -= float(np.log(np.abs(np.diag(upper))).sum())
         columns, z = columns - basis @ (basis.T @ columns), z - basis @ (basis.T @ z)
         if len(flat):
