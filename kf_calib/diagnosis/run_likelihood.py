@@ -99,7 +99,7 @@ class RunLikelihood:
         of_prior = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
         self._states = design.shape[2]
         z = (self._root @ readings[..., None])[..., 0]
-        columns, within = self._made(effects, known, blocks, z, spanned(np.vstack(self._root @ design))[0])
+        columns, within = self._made(effects, known, blocks, z, spanned((self._root @ design).reshape(z.size, -1))[0])
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
@@ -137,7 +137,7 @@ class RunLikelihood:
             of_terms = of_states.beside(added) if known < model.count else added
             design = self._root[few] @ means_of(some, of_terms).design
             _combine(design, blocks, columns[few])
-            along += basis[3 * few.start : 3 * few.stop].T @ np.vstack(design)
+            along += basis[3 * few.start : 3 * few.stop].T @ design.reshape(-1, design.shape[2])
             squares += np.einsum("dic,dic->c", design, design)
             within.add(some, values[pieces], added.values, pieces, np.maximum(squares - np.sum(along**2, axis=0), 0.0))
         return columns, within
