@@ -454,11 +454,23 @@ class RunPosterior:
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._without_refused([self._refitted(row) if id(row) in likeliest else row for row in rows])
-        while more := _to_be_fitted(fitted):
+        while more := self._to_be_fitted(fitted):
             fitted = self._without_refused([self._refitted(row) if id(row) in more else row for row in fitted])
         first = max(fitted, key=lambda row: row.log_evidence)
         least = first.log_evidence + math.log(LISTED)  # others are not shown
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
+
+    def _to_be_fitted(self, rows: Sequence[Hypothesis]) -> set[int]:
+        """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
+        beside effects, of these alone and of their likeliest pairs: beside each other, constants are others than
+        alone, but for a random walk, which has none."""
+        first, *others = sorted(rows, key=lambda row: -row.log_evidence)
+        likeliest = [first]
+        if first.driver:
+            known = [row for row in others if first.effects and not row.driver]
+            pairs = [row for row in known if {*first.effects} < {*row.effects} and self._run.walk not in row.effects]
+            likeliest = [*(row for row in known if {*row.effects} == {*first.effects}), *pairs[:_BESIDE]]
+        return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
     def _without_refused(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows without an effect that its fit has refused: one with which the run tells nothing, or an
@@ -589,18 +601,6 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
-
-
-def _to_be_fitted(rows: Sequence[Hypothesis]) -> set[int]:
-    """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
-    beside effects, of these alone and of their likeliest pairs: beside each other, constants are others than alone."""
-    first, *others = sorted(rows, key=lambda row: -row.log_evidence)
-    likeliest = [first]
-    if first.driver:
-        known = [row for row in others if first.effects and not row.driver]
-        with_more = [row for row in known if {*first.effects} < {*row.effects}][:_BESIDE]
-        likeliest = [*(row for row in known if {*row.effects} == {*first.effects}), *with_more]
-    return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
 
 def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:

@@ -37,8 +37,9 @@ _FEW, _NODES_OF_FEW = 2, 20  # columns of which a step twice as long sums it to 
 _SAME = 0.999  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
-_WAVES = 40  # of a random walk
-_RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
+_FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, up to two a dwell, and of what is smooth
+_RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
+_RETURNS, _PER_DWELL = (5, 18, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
 """All columns of a term."""
@@ -51,8 +52,8 @@ class RunTerm:
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. relation: the number of that of its
     coefficients. summands: of the unknown function, those that it has. bearers: columns of each accelerometer, or of
-    each axis of a rotation, that may have it alone. only: which of the columns of all bearers these are. sizes: of its
-    coefficients. scales: factors (q,) of its columns.
+    each axis of a rotation, that may have it alone. only: which of the columns of all bearers these are. apart: each
+    bearer may also have its own size. sizes: of its coefficients. scales: factors (q,) of its columns.
     """
 
     row: str
@@ -63,6 +64,7 @@ class RunTerm:
     summands: tuple[int, ...] = ()
     bearers: tuple[slice, ...] = ()
     only: slice = field(default_factory=lambda: EVERY)
+    apart: bool = False
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
 
@@ -177,21 +179,29 @@ class RunTerms:
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 
     def _add_walk(self, columns: _Columns) -> None:
-        """Add a random walk of the biases and, unknown, one of the scale factors, and biases that change as irregularly
-        and come back: the spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
+        """Add a random walk of the biases and, unknown, one of the scale factors; either as the integral of a walk is,
+        smooth, with a spectrum that falls with w^2 more; and biases that change as irregularly and come back: the
+        spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
         w^2 tau^2 / (1 + w^2 tau^2)."""
-        dwells = self._linearised.dwells
-        waves = _Walk(dwells[-1].end_s, min(len(dwells), _WAVES))
-        block = columns.block(columns.add([waves]))
-        columns.term(self.walk, [block], 0.0)
-        times_s = [waves.run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
-        of_scale = columns.block(columns.add([_Walk(waves.run_s, len(waves.rates), of_scale=True)]))
-        self.unknown.append(UnknownTerm("time and specific force (irregular)", "scale in time", ()))
-        columns.term(f"?{len(self.unknown) - 1}", [of_scale], 0.0)
-        self.unknown.append(UnknownTerm(RETURNING, effect_named(self.walk, self.bench).family, ()))
-        for time_s in times_s:
-            scales = np.tile(1.0 / np.sqrt(1.0 + 1.0 / np.square(waves.rates * time_s)), 3)
-            columns.term(f"?{len(self.unknown) - 1}", [block], -math.log(len(times_s)), scales=scales)
+        dwells, family = self._linearised.dwells, effect_named(self.walk, self.bench).family
+        run_s, count = dwells[-1].end_s, min(max(len(dwells), _FEWEST_WAVES), 2 * len(dwells), _WAVES)
+        taus_s = [run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
+
+        def block(waves: _Walk) -> int:
+            return columns.block(columns.add([waves]))
+
+        def add(driver: str, family: str, block: int, *scales: Floats) -> None:
+            self.unknown.append(UnknownTerm(driver, family, ()))
+            for each in scales:
+                columns.irregular(f"?{len(self.unknown) - 1}", block, -math.log(len(scales)), each)
+
+        of_bias, of_scale, few = _Walk(run_s, count), _Walk(run_s, count, of_scale=True), min(count, _SMOOTH)
+        rates, at_bias, at_scale, smooth = of_bias.rates, block(of_bias), block(of_scale), 1.0 / of_bias.rates[:few]
+        columns.irregular(self.walk, at_bias, 0.0, np.ones(count))
+        add("time (smooth)", family, block(_Walk(run_s, few)), smooth / smooth[0])
+        add("time and specific force (smooth)", "scale in time", block(_Walk(run_s, few, True)), smooth / smooth[0])
+        add("time and specific force (irregular)", "scale in time", at_scale, np.ones(count))
+        add(RETURNING, family, at_bias, *(1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s))
 
     def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
         """What is left of the courses of the readings within dwells by an unknown function, as a term has it and as it
@@ -253,11 +263,28 @@ class RunTerms:
             for log_share, only in of_bearers(term.bearers):
                 places, log = term.columns[only], term.log_share + log_share
                 if len(places) == len(term.columns):
-                    yield replace(term, log_share=log)
+                    yield replace(term, log_share=log + term.apart * math.log(0.5))
+                    if term.apart:
+                        scales = self._ratios(term.columns) * (1.0 if term.scales is None else term.scales)
+                        yield replace(term, log_share=log + math.log(0.5 * _RATIO), scales=scales)
                 elif (lengths[places] > SEEN * raw[places]).any():
-                    part, least = replace(term, columns=places, log_share=log, only=only), 1.0 / lengths[places].max()
+                    scales = None if term.scales is None else term.scales[only]
+                    part = replace(term, columns=places, log_share=log, only=only, scales=scales)
+                    least = 1.0 / lengths[places].max()
                     if least < _most(part):
                         yield replace(part, sizes=self._sizes(part, least))
+
+    def _ratios(self, places: Indices) -> Floats:
+        """Return factors (q,) of the columns of three accelerometers: the size that is likeliest for each of them alone
+        in the noise that was stated, over the largest."""
+        rows = self.likelihood.projected(None, places)
+        columns = rows.of(places).reshape(len(rows.readings), 3, -1)
+        values, vectors = np.linalg.eigh(np.einsum("rik,ril->ikl", columns, columns))
+        along = np.einsum("r,rik,ikl->il", rows.readings, columns, vectors) ** 2
+        squares = np.geomspace(1.0, 1e8, 2 * _NODES)[:, None, None] / values.max()
+        logs = np.sum(squares * along / (1.0 + squares * values) - np.log1p(squares * values), axis=2)
+        likeliest = np.sqrt(squares[logs.argmax(axis=0), 0, 0])
+        return np.repeat(likeliest / likeliest.max(), columns.shape[2])
 
     def _sizes(self, term: RunTerm, least: float) -> Sizes:
         """Return the sizes of a term from the least that is seen."""
@@ -349,10 +376,17 @@ class _Columns:
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
              relation: int = 0, summands: tuple[int, ...] = (), bearers: tuple[slice, ...] = (),
-             scales: Floats | None = None) -> None:  # fmt: skip
+             apart: bool = False, scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, scales=scales))
+        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, EVERY, apart,
+                                  scales=scales))  # fmt: skip
+
+    def irregular(self, row: str, block: int, log_share: float, scales: Floats) -> None:
+        """Add a term with the waves (3 n,) of a block, each of the three accelerometers with these factors (n,)."""
+        count = len(scales)
+        bearers = tuple(slice(k, k + count) for k in range(0, 3 * count, count))
+        self.term(row, [block], log_share, bearers=bearers, apart=True, scales=np.tile(scales, 3))
 
 
 class _Visits(Effect):

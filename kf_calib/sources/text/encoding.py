@@ -17,6 +17,7 @@ from pathlib import Path
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
+from kf_calib.sources.text.documents import objects_in
 
 LONGEST_LINE_BYTES = 1 << 20
 _GZIP = b"\x1f\x8b"
@@ -51,6 +52,8 @@ class TextFile(AbstractContextManager["TextFile"]):
             raise
         encoding = encoding_of(self._head)
         self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
+        plain = self._decoder is None
+        self._objects = objects_in(self._head if plain else self._head.decode(encoding, "ignore").encode())
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -61,12 +64,18 @@ class TextFile(AbstractContextManager["TextFile"]):
         return self._text.fraction if self._text else min(self._raw.tell() / self._size, 1.0)
 
     def read(self, size: int) -> bytes:
-        """The next bytes, about so many; none at the end."""
+        """The next bytes, about so many; none at the end. Of objects over several lines, a line each."""
+        while block := self._decoded(size):
+            if lines := self._objects.push(block) if self._objects else block:
+                return lines
+        return self._objects.rest() if self._objects else b""
+
+    def _decoded(self, size: int) -> bytes:
         block = self.unpacked(size)
         if self._decoder is None:
             return block
         text = self._decoder.decode(block, final=not block)
-        return text.encode() or (self.read(size) if block else b"")
+        return text.encode() or (self._decoded(size) if block else b"")
 
     def unpacked(self, size: int) -> bytes:
         """The next bytes as they stand in the file, or in what gzip has packed there, so many; fewer at the end."""

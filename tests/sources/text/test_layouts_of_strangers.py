@@ -1,7 +1,9 @@
 """Logs in layouts that their loggers chose: readings and stamps are those of the file, without an option."""
 
+import json
 import zipfile
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from kf_calib.errors import InputError
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.opening import kind_of, opened
+from kf_calib.sources.text.documents import ArrayOfJson
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.names import Meaning, meaning_of
 from kf_calib.sources.text.units import Units
@@ -130,10 +133,49 @@ def test_a_unit_may_be_written_with_any_signs_of_powers_and_products(name: str, 
     assert meaning_of(name) == Meaning(name[:2], told)
 
 
-def test_one_array_of_json_is_refused_with_what_makes_lines_of_it(run: Any, tmp_path: Path) -> None:
-    path = tmp_path / "all.json"
-    path.write_text('[\n{"t": 0, "ax": 1}\n]\n')
-    assert "jq -c" in run.refused("info", path)
+def echoed(vector: str, secs: str, nsecs: str, t: float, force: list[float]) -> str:
+    """A message as the tools of ROS print it; a covariance is a list in a line, or an item a line."""
+    stamp, values = whole(t, 1.0), "\n".join(f"  {axis}: {value!r}" for axis, value in zip("xyz", force, strict=True))
+    covariance = "[-1.0, 0.0, 0.0]" if secs == "secs" else "\n- -1.0\n- 0.0\n- '...'"
+    return (f"header: \n  stamp: \n    {secs}: {stamp[0]}\n    {nsecs}: {stamp[1]}\n  frame_id: \"imu: left\"\n"
+            f"{vector}_covariance: {covariance}\n{vector}: \n{values}\n---\n")  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", ["an array", "an array over many lines", "rostopic echo", "ros2 topic echo"])
+def test_objects_of_many_lines_are_read(layout: str, tmp_path: Path) -> None:
+    rows = [(STEP_S * k, force) for k, force in enumerate(FORCES.tolist())]
+    if layout.startswith("an array"):
+        objects = [{"time": t, "note": 'a } or \\" in words', "acc": dict(zip("xyz", f, strict=True))} for t, f in rows]
+        content = json.dumps(objects, indent=1 if "many" in layout else None)
+    else:
+        stamp = ("secs", "nsecs") if layout == "rostopic echo" else ("sec", "nanosec")
+        content = "".join(echoed("linear_acceleration", *stamp, *row) for row in rows).removesuffix("---\n")
+    path = tmp_path / "log.txt"
+    path.write_text(content, encoding="utf-16" if "many" in layout else "utf-8")
+    assert kind_of(path) is FileKind.SAMPLES
+    batches = list(opened(path, {"gravity_mps2": str(G)}, angles=False))
+    np.testing.assert_allclose(np.concatenate([batch.accel.values for batch in batches]), FORCES, atol=1e-9)
+    times_ns = np.concatenate([batch.accel.time_ns for batch in batches])
+    np.testing.assert_allclose(np.diff(times_ns), 1e9 * STEP_S, atol=1e6)
+
+
+@pytest.mark.parametrize("size", [1, 7, 100_000])
+def test_objects_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> None:
+    array = json.dumps([{"t": k, "a": [1, {"b": 'x } \\" {'}]} for k in range(50)], indent=2).encode()
+    objects = ArrayOfJson()
+    lines = b"".join(objects.push(array[k : k + size]) for k in range(0, len(array), size)).splitlines()
+    assert [json.loads(line)["t"] for line in lines] == [*range(50)]
+
+
+def test_an_object_without_an_end_is_a_line_that_is_refused() -> None:
+    objects = ArrayOfJson()
+    assert objects.push(b'[{"t": 1}, {"x": "' + bytes(2_000_000)).splitlines()[0] == b'{"t": 1}'
+    assert objects.push(b"") == b""  # it is not kept
+
+
+def test_one_array_of_json_as_a_stream_is_refused_with_what_makes_lines_of_it() -> None:
+    with pytest.raises(InputError, match="jq -c"):
+        list(Lines(BytesIO(b'[\n{"t": 0, "ax": 1}\n]\n'), angles=False))
 
 
 def test_an_archive_is_to_be_unpacked(run: Any, tmp_path: Path) -> None:

@@ -1,0 +1,106 @@
+"""Objects that take more than a line each, as lines of JSON with one object each: those of one array of JSON, and the
+messages that ``rostopic echo`` and ``ros2 topic echo`` print as documents of YAML.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from abc import ABC, abstractmethod
+from collections import Counter
+
+_ARRAY = re.compile(rb"\s*\[\s*\{")
+_BRACE = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\Z)|[{}]', re.DOTALL)
+_BORDER = re.compile(r"(?m)^---[ \t]*\r?$\n?")
+_LINE = re.compile(r"[ \t]*(-|- .*|(- )?[\w./]+:( .*)?)")
+_KEY = re.compile(r"([^\s:'\"\[]+):(?:\s+(.*))?")
+_FEWEST_LINES = 3
+_LONGEST_BYTES = 1 << 20
+
+
+class Objects(ABC):
+    """Cuts text, block by block, into objects; one that does not end in a megabyte is given as it is."""
+
+    def __init__(self) -> None:
+        self._tail = b""
+
+    def push(self, block: bytes) -> bytes:
+        """The objects that end in a block of UTF-8, a line each."""
+        objects, self._tail = self._cut(self._tail + block)
+        if len(self._tail) > _LONGEST_BYTES:
+            objects, self._tail = [*objects, self._tail], b""
+        return b"".join(each.replace(b"\r", b" ").replace(b"\n", b" ") + b"\n" for each in objects)
+
+    @abstractmethod
+    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]: ...
+
+    def rest(self) -> bytes:
+        """What has not ended, if it is any object."""
+        return b""
+
+
+class ArrayOfJson(Objects):
+    """The objects in one array."""
+
+    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]:
+        objects, depth, first, end = list[bytes](), 0, 0, 0
+        for match in _BRACE.finditer(text):
+            if match[0] == b"{":
+                first = first if depth else match.start()
+                depth += 1
+            elif match[0] == b"}" and depth:
+                depth -= 1
+                if not depth:
+                    end = match.end()
+                    objects.append(text[first:end])
+        return objects, text[end:]
+
+
+class EchoedMessages(Objects):
+    """The documents of YAML between lines of three hyphens."""
+
+    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]:
+        *documents, tail = _BORDER.split(text.decode("utf-8", "surrogateescape"))
+        return [_flat(document) for document in documents if document.strip()], tail.encode("utf-8", "surrogateescape")
+
+    def rest(self) -> bytes:
+        return self.push(b"\n---\n")
+
+
+def objects_in(head: bytes) -> Objects | None:
+    """What cuts a text that begins so into objects; None where its lines are to be read as they are."""
+    if _ARRAY.match(head.removeprefix(b"\xef\xbb\xbf")):
+        return ArrayOfJson()
+    documents = _BORDER.split(head.decode("utf-8", "replace").lstrip("\ufeff"))
+    lines = next((lines for each in documents[:-1] if (lines := each.strip().splitlines())), [])
+    is_echo = len(lines) >= _FEWEST_LINES and all(_LINE.fullmatch(line) for line in lines)
+    return EchoedMessages() if is_echo else None
+
+
+def _flat(document: str) -> bytes:
+    """Return a document of nested keys and lists as one object, of which the keys are paths, as ``stamp.sec``."""
+    path, items, cells = list[tuple[int, str]](), Counter[str](), list[str]()
+    for line in filter(str.strip, document.splitlines()):
+        body = line.strip()
+        indent = 2 * (len(line) - len(line.lstrip()))
+        if body == "-" or body.startswith("- "):  # the key of a list may stand as far to the left as its items
+            path = [(at, key) for at, key in path if at <= indent]
+            name = ".".join(key for _, key in path)
+            path.append((indent + 1, str(items[name])))
+            items[name] += 1
+            body, indent = body[2:].strip(), indent + 4
+        if match := _KEY.fullmatch(body):
+            path = [*((at, key) for at, key in path if at < indent), (indent, match[1])]
+            body = (match[2] or "").strip()
+        if body:
+            cells.append(f"{json.dumps('.'.join(key for _, key in path))}: {_of_json(body)}")
+    return f"{{{', '.join(cells)}}}".encode("utf-8", "surrogateescape")
+
+
+def _of_json(value: str) -> str:
+    """Return a number, a text, or a list of them between brackets, as JSON has it."""
+    try:
+        float(value)
+    except ValueError:
+        return value.replace("'", '"') if value.startswith("[") else json.dumps(value.strip("'\""))
+    return value
