@@ -152,6 +152,25 @@ def bare_numbers() -> str:
     )
 
 
+def json_array() -> str:
+    rows = zip(SECONDS.tolist(), *readings().T.tolist(), strict=True)
+    return json.dumps(
+        [{"sensor": "Accelerometer", "seconds_elapsed": t, "z": z, "y": y, "x": x} for t, x, y, z in rows]
+    )
+
+
+def echoed_messages() -> str:
+    """The first fields of each message, as ``ros2 topic echo`` prints them."""
+    rows = zip(map(int, stamps_ns()), readings().tolist(), others().tolist(), strict=True)
+    return "".join(
+        f"header:\n  stamp:\n    sec: {at_ns // 10**9}\n    nanosec: {at_ns % 10**9}\n  frame_id: imu\n"
+        + "".join(f"{name}:\n  x: {x}\n  y: {y}\n  z: {z}\n{name}_covariance:\n- 0.0\n- 0.0\n- '...'\n"
+                  for name, (x, y, z) in (("angular_velocity", turning), ("linear_acceleration", force)))
+        + "---\n"
+        for at_ns, force, turning in rows
+    )  # fmt: skip
+
+
 def json_lines() -> str:
     """An object a line, as a script of a web page or a message queue writes it."""
     return "".join(
@@ -299,6 +318,10 @@ FOREIGN_LOGS: Mapping[str, ForeignLog] = {
     "a German Excel": ForeignLog("log.csv", lambda path: path.write_text(german_table(), encoding="cp1252")),
     "numbers alone": ForeignLog("log.txt", lambda path: path.write_text(bare_numbers())),
     "JSON lines": ForeignLog("log.jsonl", lambda path: path.write_text(json_lines())),
+    "an array of JSON": ForeignLog("log.json", lambda path: path.write_text(json_array())),
+    "ros2 topic echo": ForeignLog(
+        "log.txt", lambda path: path.write_text(echoed_messages()), echoed_messages().partition("\n---")[0] + "\n---"
+    ),
     "a struct of MATLAB": ForeignLog(
         "log.mat",
         matlab,
