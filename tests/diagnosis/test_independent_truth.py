@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from kf_calib.estimation.calibration import Settings, calibrate
 
 WITHIN_RAD = 2e-5
 """Size of what is hidden: some ten times what a dwell knows."""
+UNSTATED = replace(BENCH, angle_sigma_deg=None, scatter_sigma_mps2=None)
 
 
 def diagnosed(bench: IndependentBench) -> Diagnosis:
@@ -217,6 +219,38 @@ def test_what_decays_after_every_arrival_is_no_warm_up(time_constant_s: float, s
     for seed in seeds:
         found = diagnosed(IndependentBench(seed, bias=arriving))
         assert not found.missing and found.unknown and "time since arrival" in found.verdict, found.verdict
+
+
+def walking(seed: int, sizes: tuple[float, float, float], state: State) -> np.ndarray:
+    """Random walks (n, 3) of the biases, m/s^2 a root second."""
+    normal = np.random.default_rng([seed, 8]).standard_normal((len(state.time_s), 3))
+    return np.cumsum(normal * np.sqrt(np.gradient(state.time_s))[:, None], axis=0) * np.array(sizes)
+
+
+@pytest.mark.parametrize(("dwells", "sizes"), [
+    (12, (0.0, 1e-5, 0.0)), *slow((24, (1e-5, 0.0, 0.0)), (16, (0.0, 0.0, 1e-5)), (24, (2e-6, 7e-6, 1e-6)),
+                                  (12, (1e-5, 3e-6, 5e-6))),
+])  # fmt: skip
+@pytest.mark.parametrize("bench", [BENCH, *slow(UNSTATED)])
+def test_a_walk_is_named_whichever_accelerometer_walks(
+    dwells: int, sizes: tuple[float, float, float], bench: Bench
+) -> None:
+    """It was irregular, chance, or an oscillation where not all three walked alike."""
+    for seed in (21, 22):
+        run = IndependentBench(seed, dwells, bias=partial(walking, seed, sizes), bench=bench)
+        diagnosis = kf_calib.diagnose(run, replicate=False)
+        assert diagnosis.missing == ("bias-walk",), diagnosis.verdict
+
+
+@pytest.mark.parametrize("seed", [31, *slow(32, 33)])
+def test_what_changes_smoothly_in_a_way_that_nobody_knows_is_no_walk(seed: int) -> None:
+    def rising(state: State) -> np.ndarray:
+        share = state.time_s / state.time_s[-1]
+        return 6e-5 * np.tanh((share - 0.45) / 0.12)[:, None] * np.array([1.0, -0.4, 0.7])
+
+    diagnosis = kf_calib.diagnose(IndependentBench(seed, bias=rising, bench=UNSTATED), replicate=False)
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.table is not None and diagnosis.table.probability(["bias-walk"]) < 0.5
 
 
 @pytest.mark.parametrize("name", ["a cable winds up", "a gimbal creeps one way", *slow(
