@@ -39,7 +39,7 @@ _END = 0.99  # of the range of a constant
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
 _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, up to two a dwell, and of what is smooth
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
-_RETURNS, _PER_DWELL = (5, 18, 64), 0.75  # parts of a run within which a bias may come back, and most of them
+_RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
 """All columns of a term."""

@@ -135,7 +135,7 @@ def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() ->
 
 @pytest.mark.slow  # test_stepwise_selection.py adds the same two
 def test_two_effects_at_once_are_both_found() -> None:
-    found = diagnose(source("hysteresis=15sigma", "thermal-scale=15sigma"))
+    found = diagnose(source("hysteresis=15sigma", "thermal-scale=20sigma"))
     assert set(found.missing) == {"hysteresis", "thermal-scale"}
 
 
