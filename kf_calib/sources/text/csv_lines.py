@@ -73,6 +73,8 @@ class CsvLines(LineReader):
 
     def _row(self, line: str) -> SampleRow | None:
         if not (cells := self._heading.cells(line)):
+            if self._heading.has_objects:
+                raise LineError("it is no whole object of JSON")
             return None  # of something else than readings
         number, self._count, width = self._count, self._count + 1, len(self._header)
         row = cells if len(cells) == width else without_empty_end(cells, width)

@@ -11,15 +11,16 @@ from collections import Counter
 
 _ARRAY = re.compile(rb"\s*\[\s*\{")
 _BRACE = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\Z)|[{}]', re.DOTALL)
-_BORDER = re.compile(r"(?m)^---[ \t]*\r?$\n?")
+_BORDER = re.compile(r"(?m)^---[ \t]*\r?\n")
 _LINE = re.compile(r"[ \t]*(-|- .*|(- )?[\w./]+:( .*)?)")
 _KEY = re.compile(r"([^\s:'\"\[]+):(?:\s+(.*))?")
 _FEWEST_LINES = 3
-_LONGEST_BYTES = 1 << 20
+LONGEST_LINE_BYTES = 1 << 20
 
 
 class Objects(ABC):
-    """Cuts text, block by block, into objects; one that does not end in a megabyte is given as it is."""
+    """Cuts text, block by block, into objects. One that does not end, or not in a megabyte, is given as it is, for the
+    reader of lines to refuse and count."""
 
     def __init__(self) -> None:
         self._tail = b""
@@ -27,16 +28,17 @@ class Objects(ABC):
     def push(self, block: bytes) -> bytes:
         """The objects that end in a block of UTF-8, a line each."""
         objects, self._tail = self._cut(self._tail + block)
-        if len(self._tail) > _LONGEST_BYTES:
+        if len(self._tail) > LONGEST_LINE_BYTES:
             objects, self._tail = [*objects, self._tail], b""
-        return b"".join(each.replace(b"\r", b" ").replace(b"\n", b" ") + b"\n" for each in objects)
+        return b"".join(map(_as_line, objects))
 
     @abstractmethod
     def _cut(self, text: bytes) -> tuple[list[bytes], bytes]: ...
 
     def rest(self) -> bytes:
-        """What has not ended, if it is any object."""
-        return b""
+        """A line of what has not ended; none if there is nothing but the end of an array."""
+        tail, self._tail = self._tail.strip(b" \t\r\n,]"), b""
+        return _as_line(tail) if tail else b""
 
 
 class ArrayOfJson(Objects):
@@ -63,9 +65,6 @@ class EchoedMessages(Objects):
         *documents, tail = _BORDER.split(text.decode("utf-8", "surrogateescape"))
         return [_flat(document) for document in documents if document.strip()], tail.encode("utf-8", "surrogateescape")
 
-    def rest(self) -> bytes:
-        return self.push(b"\n---\n")
-
 
 def objects_in(head: bytes) -> Objects | None:
     """What cuts a text that begins so into objects; None where its lines are to be read as they are."""
@@ -75,6 +74,10 @@ def objects_in(head: bytes) -> Objects | None:
     lines = next((lines for each in documents[:-1] if (lines := each.strip().splitlines())), [])
     is_echo = len(lines) >= _FEWEST_LINES and all(_LINE.fullmatch(line) for line in lines)
     return EchoedMessages() if is_echo else None
+
+
+def _as_line(text: bytes) -> bytes:
+    return text.replace(b"\r", b" ").replace(b"\n", b" ") + b"\n"
 
 
 def _flat(document: str) -> bytes:

@@ -17,9 +17,8 @@ from pathlib import Path
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
-from kf_calib.sources.text.documents import objects_in
+from kf_calib.sources.text.documents import LONGEST_LINE_BYTES, objects_in
 
-LONGEST_LINE_BYTES = 1 << 20
 _GZIP = b"\x1f\x8b"
 LARGEST_TABLE_BYTES = 50_000_000
 TOO_LARGE = (
@@ -65,10 +64,12 @@ class TextFile(AbstractContextManager["TextFile"]):
 
     def read(self, size: int) -> bytes:
         """The next bytes, about so many; none at the end. Of objects over several lines, a line each."""
+        if self._objects is None:
+            return self._decoded(size)
         while block := self._decoded(size):
-            if lines := self._objects.push(block) if self._objects else block:
+            if lines := self._objects.push(block):
                 return lines
-        return self._objects.rest() if self._objects else b""
+        return self._objects.rest()
 
     def _decoded(self, size: int) -> bytes:
         block = self.unpacked(size)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -115,6 +115,11 @@ class TextHeading(NamedTuple):
             rows, header = [[face, *cells] for face, cells in zip(faces, rows, strict=True)], ["face", *header]
         return cls(header, ",", numbers[0], rows, labels=labels, numbers=numbers)
 
+    @property
+    def has_objects(self) -> bool:
+        """Whether each line below is an object of JSON."""
+        return self.delimiter == _JSON
+
     def cells(self, line: str) -> list[str]:
         """The cells of a line below; none where it has other labels than those of readings."""
         if self.labels:
@@ -124,7 +129,7 @@ class TextHeading(NamedTuple):
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
-        if self.delimiter == _JSON:
+        if self.has_objects:
             places = {path: (start, end) for path, start, end in scalars(line)}
             return [places.get(path, (0, 0)) for path in self.labels] if places else []
         if self.labels:
@@ -142,9 +147,10 @@ class TextHeading(NamedTuple):
         ]
 
 
-def scalars(line: str) -> Iterator[tuple[str, int, int]]:
-    """The path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none."""
-    keys = list[str | int]()
+def scalars(line: str) -> list[tuple[str, int, int]]:
+    """The path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none. Of an object that
+    does not end there are none: the last number may lack digits."""
+    keys, places = list[str | int](), list[tuple[str, int, int]]()
     for match in _JSON_TOKEN.finditer(line):
         if match[2] and keys:
             keys[-1] = match[1]
@@ -155,7 +161,8 @@ def scalars(line: str) -> Iterator[tuple[str, int, int]]:
         elif match[0] == ",":
             keys[-1:] = [key + 1 if isinstance(key, int) else key for key in keys[-1:]]
         elif match[0] != "null":
-            yield ".".join(map(str, keys)), *match.span()
+            places.append((".".join(map(str, keys)), *match.span()))
+    return [] if keys else places
 
 
 def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:

@@ -13,7 +13,7 @@ import pytest
 from kf_calib.errors import InputError
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.opening import kind_of, opened
-from kf_calib.sources.text.documents import ArrayOfJson
+from kf_calib.sources.text.documents import ArrayOfJson, EchoedMessages
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.names import Meaning, meaning_of
 from kf_calib.sources.text.units import Units
@@ -149,7 +149,7 @@ def test_objects_of_many_lines_are_read(layout: str, tmp_path: Path) -> None:
         content = json.dumps(objects, indent=1 if "many" in layout else None)
     else:
         stamp = ("secs", "nsecs") if layout == "rostopic echo" else ("sec", "nanosec")
-        content = "".join(echoed("linear_acceleration", *stamp, *row) for row in rows).removesuffix("---\n")
+        content = "".join(echoed("linear_acceleration", *stamp, *row) for row in rows)
     path = tmp_path / "log.txt"
     path.write_text(content, encoding="utf-16" if "many" in layout else "utf-8")
     assert kind_of(path) is FileKind.SAMPLES
@@ -165,6 +165,33 @@ def test_objects_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> Non
     objects = ArrayOfJson()
     lines = b"".join(objects.push(array[k : k + size]) for k in range(0, len(array), size)).splitlines()
     assert [json.loads(line)["t"] for line in lines] == [*range(50)]
+
+
+@pytest.mark.parametrize("size", [1, 4, 100_000])
+def test_messages_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> None:
+    """A line that begins like a border is none."""
+    text = "".join(f"header:\n  seq: {k}\nnote: 'a'\n---b: 1\nvalues:\n- {k}.5\n- µ\n---\n" for k in range(50)).encode()
+    objects = EchoedMessages()
+    lines = b"".join(objects.push(text[k : k + size]) for k in range(0, len(text), size)).splitlines()
+    assert [json.loads(line)["values.0"] for line in lines] == [k + 0.5 for k in range(50)]
+    assert json.loads(lines[7]) == {"header.seq": 7, "note": "a", "---b": 1, "values.0": 7.5, "values.1": "µ"}
+    assert objects.rest() == b""
+
+
+@pytest.mark.parametrize("end", range(1, 45, 7))
+@pytest.mark.parametrize("layout", ["an array", "ros2 topic echo"])
+def test_of_a_log_that_was_cut_the_last_object_is_counted_and_not_read(layout: str, end: int, tmp_path: Path) -> None:
+    """A number of it may lack its last digits."""
+    rows = [(STEP_S * k, force) for k, force in enumerate(FORCES.tolist())]
+    if layout == "an array":
+        content = json.dumps([{"t": t, "x": f[0], "y": f[1], "z": f[2]} for t, f in rows])[:-1]
+    else:
+        content = "".join(echoed("acc", "sec", "nanosec", *row) for row in rows).removesuffix("---\n")
+    path = tmp_path / "log.txt"
+    path.write_text(content[:-end])
+    source = Lines(path, {"gravity_mps2": str(G)}, angles=False)
+    np.testing.assert_allclose(forces_in(source), FORCES[:-1], atol=1e-9)
+    assert any("1 of 720 lines were malformed" in warning for warning in source.warnings)
 
 
 def test_an_object_without_an_end_is_a_line_that_is_refused() -> None:
