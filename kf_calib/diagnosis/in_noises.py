@@ -23,7 +23,6 @@ from kf_calib.estimation.candidate_scan import SEEN
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
-_EVERY = slice(None)
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -123,7 +122,7 @@ class InNoises:
     def __len__(self) -> int:
         return len(self.logs)
 
-    def dwells(self, rows: Spanned, without: Sequence[int] = (), sizes: slice = _EVERY) -> tuple[Floats, Floats]:
+    def dwells(self, rows: Spanned, without: Sequence[int], sizes: slice) -> tuple[Floats, Floats]:
         """G^T W G (K, D, 3, 3) and G^T W z (K, D, 3) of offsets of the three accelerometers in one dwell, as the others
         tell, without some of them, in some of the sizes.
 

@@ -99,13 +99,14 @@ class RunLikelihood:
         of_prior = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
         self._states = design.shape[2]
         z = (self._root @ readings[..., None])[..., 0]
-        columns, within = self._made(effects, known, blocks, z, spanned((self._root @ design).reshape(z.size, -1))[0])
+        whitened = self._root @ design
+        columns, within = self._made(effects, known, blocks, z, spanned(whitened.reshape(z.size, -1).copy())[0])
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
         self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(combined**2, axis=0))
         more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
-        self.spanned = _off(self._root @ design, columns, z, of_model, combined, more_z)
+        self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
         self.spanned = replace(self.spanned, log=self.spanned.log + log_root + within.log)
 

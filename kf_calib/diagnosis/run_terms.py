@@ -19,7 +19,7 @@ from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_g
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
 from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, UnknownTerm, text_named, unknown_terms
-from kf_calib.diagnosis.within_rows import Courses
+from kf_calib.diagnosis.within_rows import Courses, log_bayes_by_size
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.effect import Grade
@@ -52,8 +52,9 @@ class RunTerm:
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. relation: the number of that of its
     coefficients. summands: of the unknown function, those that it has. bearers: columns of each accelerometer, or of
-    each axis of a rotation, that may have it alone. only: which of the columns of all bearers these are. apart: each
-    bearer may also have its own size. sizes: of its coefficients. scales: factors (q,) of its columns.
+    each axis of a rotation, that may have it alone. only: which of the columns of all bearers these are. sizes: of its
+    coefficients. scales: factors (q,) of the waves of what is irregular, which each accelerometer may have by its own
+    size.
     """
 
     row: str
@@ -64,7 +65,6 @@ class RunTerm:
     summands: tuple[int, ...] = ()
     bearers: tuple[slice, ...] = ()
     only: slice = field(default_factory=lambda: EVERY)
-    apart: bool = False
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
 
@@ -183,35 +183,34 @@ class RunTerms:
         smooth, with a spectrum that falls with w^2 more; and biases that change as irregularly and come back: the
         spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
         w^2 tau^2 / (1 + w^2 tau^2)."""
-        dwells, family = self._linearised.dwells, effect_named(self.walk, self.bench).family
+        dwells = self._linearised.dwells
         run_s, count = dwells[-1].end_s, min(max(len(dwells), _FEWEST_WAVES), 2 * len(dwells), _WAVES)
+        walks = [_Walk(run_s, most, of_scale) for of_scale in (False, True) for most in (count, min(count, _SMOOTH))]
+        of_bias, of_bias_smooth, of_scale, of_scale_smooth = (columns.block(columns.add([walk])) for walk in walks)
+        rates, even = walks[0].rates, np.ones(count)
+        smooth = rates[0] / walks[1].rates
         taus_s = [run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
-
-        def block(waves: _Walk) -> int:
-            return columns.block(columns.add([waves]))
-
-        def add(driver: str, family: str, block: int, *scales: Floats) -> None:
-            self.unknown.append(UnknownTerm(driver, family, ()))
-            for each in scales:
-                columns.irregular(f"?{len(self.unknown) - 1}", block, -math.log(len(scales)), each)
-
-        of_bias, of_scale, few = _Walk(run_s, count), _Walk(run_s, count, of_scale=True), min(count, _SMOOTH)
-        rates, at_bias, at_scale, smooth = of_bias.rates, block(of_bias), block(of_scale), 1.0 / of_bias.rates[:few]
-        columns.irregular(self.walk, at_bias, 0.0, np.ones(count))
-        add("time (smooth)", family, block(_Walk(run_s, few)), smooth / smooth[0])
-        add("time and specific force (smooth)", "scale in time", block(_Walk(run_s, few, True)), smooth / smooth[0])
-        add("time and specific force (irregular)", "scale in time", at_scale, np.ones(count))
-        add(RETURNING, family, at_bias, *(1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s))
+        returning = [1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s]
+        family = effect_named(self.walk, self.bench).family
+        columns.irregular(self.walk, of_bias, [even])
+        for driver, of_driver, block, scales in (
+            ("time (smooth)", family, of_bias_smooth, [smooth]),
+            ("time and specific force (smooth)", "scale in time", of_scale_smooth, [smooth]),
+            ("time and specific force (irregular)", "scale in time", of_scale, [even]),
+            (RETURNING, family, of_bias, returning),
+        ):
+            self.unknown.append(UnknownTerm(driver, of_driver, ()))
+            columns.irregular(f"?{len(self.unknown) - 1}", block, scales)
 
     def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
         """What is left of the courses of the readings within dwells by an unknown function, as a term has it and as it
         is likeliest in one noise."""
         term, rows = self.terms[k], self.likelihood.projected(covariance, self.terms[k].columns)
-        columns, squares = rows.of(term.columns), term.sizes.values[:, None] ** 2
+        columns, squares = rows.of(term.columns), term.sizes.values**2
         values, vectors = np.linalg.eigh(columns.T @ columns)
         along = vectors.T @ (columns.T @ rows.readings)
-        shrunk = squares / (1.0 + squares * values)
-        logs = term.sizes.logs + 0.5 * np.sum(shrunk * along**2 - np.log1p(squares * values), axis=1)
+        logs = term.sizes.logs + log_bayes_by_size(along**2, values, 1.0, squares).sum(axis=0)
+        shrunk = squares[:, None] / (1.0 + squares[:, None] * values)
         likeliest = vectors @ (along * (softmax(logs) @ shrunk))
         summands = self.unknown[int(term.row[1:])].summands
         effects = [self.formula_of(text) for number in term.summands for text in summands[number]]
@@ -258,15 +257,19 @@ class RunTerms:
 
     def _of_bearers(self, terms: Sequence[RunTerm]) -> Iterator[RunTerm]:
         """Yield terms, those of which each bearer has its own columns also as terms of one alone."""
-        raw, lengths = self.likelihood.lengths, self.likelihood.lengths_left
+        raw, lengths, ratios = self.likelihood.lengths, self.likelihood.lengths_left, dict[int, Floats]()
         for term in terms:
             for log_share, only in of_bearers(term.bearers):
                 places, log = term.columns[only], term.log_share + log_share
                 if len(places) == len(term.columns):
-                    yield replace(term, log_share=log + term.apart * math.log(0.5))
-                    if term.apart:
-                        scales = self._ratios(term.columns) * (1.0 if term.scales is None else term.scales)
-                        yield replace(term, log_share=log + math.log(0.5 * _RATIO), scales=scales)
+                    if term.scales is None:
+                        yield replace(term, log_share=log)
+                        continue
+                    if places[0] not in ratios:  # several terms have the same columns
+                        ratios[places[0]] = self._ratios(places)
+                    yield replace(term, log_share=log + math.log(0.5))
+                    scales = ratios[places[0]] * term.scales
+                    yield replace(term, log_share=log + math.log(0.5 * _RATIO), scales=scales)
                 elif (lengths[places] > SEEN * raw[places]).any():
                     scales = None if term.scales is None else term.scales[only]
                     part = replace(term, columns=places, log_share=log, only=only, scales=scales)
@@ -280,10 +283,10 @@ class RunTerms:
         rows = self.likelihood.projected(None, places)
         columns = rows.of(places).reshape(len(rows.readings), 3, -1)
         values, vectors = np.linalg.eigh(np.einsum("rik,ril->ikl", columns, columns))
-        along = np.einsum("r,rik,ikl->il", rows.readings, columns, vectors) ** 2
-        squares = np.geomspace(1.0, 1e8, 2 * _NODES)[:, None, None] / values.max()
-        logs = np.sum(squares * along / (1.0 + squares * values) - np.log1p(squares * values), axis=2)
-        likeliest = np.sqrt(squares[logs.argmax(axis=0), 0, 0])
+        along = np.einsum("ik,ikl->il", np.einsum("r,rik->ik", rows.readings, columns), vectors)
+        sizes = np.geomspace(1.0, 1e4, 2 * _NODES) / math.sqrt(values.max())
+        logs = log_bayes_by_size(along.ravel() ** 2, values.ravel(), 1.0, sizes**2)
+        likeliest = sizes[logs.reshape(*values.shape, -1).sum(axis=1).argmax(axis=1)]
         return np.repeat(likeliest / likeliest.max(), columns.shape[2])
 
     def _sizes(self, term: RunTerm, least: float) -> Sizes:
@@ -376,17 +379,19 @@ class _Columns:
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
              relation: int = 0, summands: tuple[int, ...] = (), bearers: tuple[slice, ...] = (),
-             apart: bool = False, scales: Floats | None = None) -> None:  # fmt: skip
+             scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, EVERY, apart,
-                                  scales=scales))  # fmt: skip
+        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, scales=scales))
 
-    def irregular(self, row: str, block: int, log_share: float, scales: Floats) -> None:
-        """Add a term with the waves (3 n,) of a block, each of the three accelerometers with these factors (n,)."""
-        count = len(scales)
-        bearers = tuple(slice(k, k + count) for k in range(0, 3 * count, count))
-        self.term(row, [block], log_share, bearers=bearers, apart=True, scales=np.tile(scales, 3))
+    def irregular(self, row: str, block: int, spectra: Sequence[Floats]) -> None:
+        """Add terms with the waves (3 n,) of a block, n of each of the three accelerometers: one term for each of some
+        factors (n,) of the waves, all as likely."""
+        for scales in spectra:
+            count = len(scales)
+            bearers = tuple(slice(k, k + count) for k in range(0, 3 * count, count))
+            log_share = -math.log(len(spectra))
+            self.term(row, [block], log_share, bearers=bearers, scales=np.tile(scales, 3))
 
 
 class _Visits(Effect):

@@ -51,18 +51,19 @@ class Courses:
         """Log Bayes factor of whatever changes the courses of all dwells, averaged over its size."""
         alike = self._by_size
         if self.made.any():
-            by_share = _log_bayes(self.along**2, self.made, 1.0, _ANY_SIZE**2 / self.made.max())
+            by_share = log_bayes_by_size(self.along**2, self.made, 1.0, _ANY_SIZE**2 / self.made.max())
             alike = np.concatenate([alike, by_share], axis=1)
         return float(np.logaddexp.reduce(alike.sum(axis=0))) - math.log(alike.shape[1])
 
     @cached_property
     def _by_size(self) -> Floats:
         """Log Bayes factors (D, sizes) of whatever changes the course of each dwell."""
-        return _log_bayes(self.squares, np.ones(len(self.squares)), self.freedom, _ANY_SIZE**2)
+        return log_bayes_by_size(self.squares, np.ones(len(self.squares)), self.freedom, _ANY_SIZE**2)
 
 
-def _log_bayes(along_squared: Floats, made: Floats, freedom: Floats | float, squares: Floats) -> Floats:
-    """Return log Bayes factors (D, sizes) of coefficients with squares of their sizes."""
+def log_bayes_by_size(along_squared: Floats, made: Floats, freedom: Floats | float, squares: Floats) -> Floats:
+    """Log Bayes factors (n, sizes) of n coefficients, each of one column g with the square made = g g, and along = g z,
+    for squares (sizes,) of their sizes; freedom: number of such columns of which along_squared is the sum."""
     spread = squares * made[:, None]
     gained = squares * along_squared[:, None] / (1.0 + spread)
     return np.asarray(0.5 * (gained - np.reshape(freedom, (-1, 1)) * np.log1p(spread)), float)

@@ -137,6 +137,9 @@ def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() ->
 def test_two_effects_at_once_are_both_found() -> None:
     found = diagnose(source("hysteresis=15sigma", "thermal-scale=20sigma"))
     assert set(found.missing) == {"hysteresis", "thermal-scale"}
+    found = diagnose(source("hysteresis=15sigma", "thermal-scale=15sigma"))  # beside what follows the temperature, 93 %
+    assert found.missing == ("hysteresis",) and found.table is not None
+    assert set(found.table.first.effects) == {"hysteresis", "thermal-scale"}
 
 
 def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
