@@ -139,7 +139,7 @@ def test_two_effects_at_once_are_both_found() -> None:
     assert set(found.missing) == {"hysteresis", "thermal-scale"}
     found = diagnose(source("hysteresis=15sigma", "thermal-scale=15sigma"))  # beside what follows the temperature, 93 %
     assert found.missing == ("hysteresis",) and found.table is not None
-    assert set(found.table.first.effects) == {"hysteresis", "thermal-scale"}
+    assert set(found.table.rows[0].effects) == {"hysteresis", "thermal-scale"}
 
 
 def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
