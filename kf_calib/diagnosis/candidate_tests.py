@@ -330,7 +330,7 @@ def _smallest_p(scan: Scan, visible: NDArray[np.intp], seed: int) -> Floats:
 def _walk_to_test(fitted: Fit) -> str:
     """Return the name of the random walk of the biases, or "" where it is in the model or cannot be tested."""
     model = fitted.linearised.model
-    if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
+    if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk.steps:
         return ""
     return walk_named(model.bench)
 

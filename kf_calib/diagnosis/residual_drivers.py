@@ -159,10 +159,10 @@ def walk_path(result: Calibration) -> Floats:
     The best linear prediction K (K + R)^-1 r from the residuals r by the final state, where K = q^2 min(T - s, T - t)
     is the covariance of a random walk that is known at its end T, and R that of the means.
     """
-    intensity, means = result.noise.walk_mps2_per_sqrt_s, result.linearised.means
-    if not intensity:
+    if not result.noise.walk.steps:
         return np.zeros_like(result.residuals_mps2)
-    covariance = intensity**2 * known_at_end(means.ends_s)
-    path = [covariance @ np.linalg.solve(covariance + np.diag(sigma**2), residual)
-            for sigma, residual in zip(mean_sigmas(result).T, result.residuals_mps2.T, strict=True)]  # fmt: skip
-    return np.array(path).T
+    by_time, path = known_at_end(result.linearised.means.ends_s), np.zeros_like(result.residuals_mps2)
+    for i, (q, sigma) in enumerate(zip(result.noise.walk_mps2_per_sqrt_s, mean_sigmas(result).T, strict=True)):
+        covariance = q**2 * by_time
+        path[:, i] = covariance @ np.linalg.solve(covariance + np.diag(sigma**2), result.residuals_mps2[:, i])
+    return path

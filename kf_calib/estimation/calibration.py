@@ -319,7 +319,7 @@ class Visits(Sequence[Visit]):
         reached = estimates(factors, around, extra)
         known, visits = reached[:-1], list[Visit]()
         if walked.any():
-            before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
+            before = [predict(factor, step) for factor, step in zip(factors, walked, strict=False)]
             known = estimates(np.array(before), around, extra[:-1])
         for k, (dwell, step) in enumerate(zip(linearised.dwells, steps, strict=True)):
             innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)

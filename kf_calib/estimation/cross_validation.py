@@ -111,7 +111,7 @@ def held_out(fitted: Fit) -> HeldOut | None:
 
     Slews are not left out of any fit. Without angles the errors are those of |f|, one a dwell.
     """
-    predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
+    predicted = (_beside if fitted.noise.walk.steps else _without)(fitted, orientations(fitted.dwells))
     if predicted is None:
         return None
     means, state = fitted.linearised.means, fitted.linearised.state
@@ -285,7 +285,7 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     linearised, noise, steps = fitted.linearised, fitted.noise.for_goodness_of_fit, fitted.steps
     rows, means, around = fitted.all_rows(noise.weights), linearised.means, linearised.model.nominal_state()
     errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise.of_readings, means, linearised.state)
-    spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
+    spreads += (steps[:, 1] / 12.0)[:, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
     first = _frame(fitted)
     alone, ways = _passes(first, rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
     for group in groups:

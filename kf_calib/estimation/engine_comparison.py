@@ -173,7 +173,7 @@ def _remarks(settings: Settings, result: Calibration) -> list[str]:
     said = []
     if not settings.prior.diffuse:
         said.append("a prior was stated: the filters use it, batch least squares does not, so it may differ.")
-    if result.noise.walk_mps2_per_sqrt_s:
+    if result.noise.walk.steps:
         said.append(
             "the biases walk: the filters follow them (the block engine by what parabolas see of a path, some 0.001 "
             "sigma), batch least squares holds them still, so it may differ."

@@ -42,7 +42,7 @@ class Fit:
 
     @property
     def steps(self) -> Floats:
-        """Variances (D, 2) of the biases' steps before and within each dwell; zeros if they do not walk."""
+        """Variances (D, 2, 3) of the biases' steps before and within each dwell; zeros if they do not walk."""
         return steps(self.dwells, self.noise)
 
     @property

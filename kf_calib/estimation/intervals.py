@@ -8,6 +8,10 @@ is +- h, where
   sum over (s, a) of P(s, a | run) P(|x - x_fit| < h | s, a) = 0.95,
 
 and no less than 1.96 sigma. Where there is scatter alone and no other noise is known, this is Student's t.
+
+Where the intensities q of a walk were estimated, each q^2 is over its estimate as nu over a chi-squared of nu degrees
+of freedom, at least one; 2 nu is the curvature of the likelihood by ln q. The estimates and sigmas of sixteen such q,
+all as likely, move and widen those of scatter and setting error.
 """
 
 from __future__ import annotations
@@ -40,6 +44,7 @@ _RANGE = math.log(1e2)  # width of the flat prior of the logarithm of a size
 _LEAST, _MOST = 0.03, 30.0  # sizes that are tried, in units of one that would explain the misfit
 _COARSE, _FINE = 14, 14  # of them, first over that range, then where they are likely
 _HOPELESS = 12.0  # in log likelihood
+_EACH = 16  # intensities of walks, each as likely
 _FREE = 0.75  # prior probability of a part of the noise that was not stated
 
 
@@ -49,7 +54,8 @@ def sigmas_of_intervals(fitted: Fit) -> Floats:
     noise, count = fitted.noise, fitted.linearised.model.count
     stated = noise.scatter.stated, noise.setting.stated or noise.attitude_unknown
     free: list[Part] = [part for part, is_stated in zip(_PARTS, stated, strict=True) if not is_stated]
-    means = _Means(fitted, free) if free and 3 * len(fitted.dwells) < _MANY else None
+    unsure = (free or noise.walk.spreads.any()) and 3 * len(fitted.dwells) < _MANY
+    means = _Means(fitted, free) if unsure else None
     if means is None or means.freedom <= 0:
         return np.full(count, NORMAL)
     with np.errstate(invalid="ignore"):
@@ -77,15 +83,17 @@ class _Means:
         size = math.sqrt(float(readings @ readings) / max(self.freedom, 1)) + FLOOR_MPS2
         shapes = [np.broadcast_to(FREE[part].shapes(means, state).sum(axis=0), (len(means.counts), 3, 3))
                   for part in free]  # fmt: skip
-        if free[0] == "common" and noise.scatter_mps2.any():  # as unequal in the accelerometers as it was estimated
+        if free[:1] == ["common"] and noise.scatter_mps2.any():  # as unequal in the accelerometers as it was estimated
             shapes[0] = shapes[0] * noise.scatter_mps2**2 / np.mean(noise.scatter_mps2**2)
         self._units = np.array([size**2 / np.einsum("dii->di", shape).max(axis=1).mean() for shape in shapes])
         self._used = mean_covariances(noise, means, state)
         self._known, self._shapes = mean_covariances(known, means, state), np.array(shapes)
-        width = 3
-        if noise.walk_mps2_per_sqrt_s:
+        width, self._walk = 3, noise.walk
+        if noise.walk.steps:
             width = readings.size
-            path = _path(means.ends_s) * noise.walk_mps2_per_sqrt_s**2
+            by_time = known_at_end(means.ends_s)
+            self._paths = np.array([np.kron(by_time, np.diag(of_one)) for of_one in np.eye(3)])
+            path = np.tensordot(self._walk.sizes**2, self._paths, axes=1)
             self._used, self._known = (_whole(each) + path for each in (self._used, self._known))
             self._shapes = np.array([_whole(shape) for shape in self._shapes])
         self._basis, self._readings = basis.reshape(-1, width, basis.shape[1]), readings.reshape(-1, width)
@@ -93,6 +101,27 @@ class _Means:
     def sigmas_of_intervals(self) -> Floats:
         """Half the lengths (p,) in units of the sigma with the noise that was taken."""
         _, about, taken = self._solved(self._used[None])
+        weights, estimates, sigmas = self._of_scatter() if len(self._units) else (np.ones(1), about, taken)
+        shifts, sigmas = (estimates - about) / taken, sigmas / taken
+        if self._walk.spreads.any():
+            moved, ratios = self._of_walks(about, taken)
+            weights = np.repeat(weights / len(moved), len(moved))
+            shifts = (shifts[:, None] + moved).reshape(len(weights), -1)
+            sigmas = (sigmas[:, None] * ratios).reshape(len(weights), -1)
+        return _half_lengths(weights, shifts, sigmas)
+
+    def _of_walks(self, about: Floats, taken: Floats) -> tuple[Floats, Floats]:
+        """Return shifts (K, p) and sigmas (K, p), in units of those taken, for intensities that are all as likely."""
+        from scipy.special import gammaincinv
+
+        at, freedom = (np.arange(_EACH) + 0.5) / _EACH, 0.5 / np.clip(self._walk.spreads, 1e-6, math.sqrt(0.5)) ** 2
+        factors = 0.5 * freedom / gammaincinv(0.5 * freedom, at[:, None])  # those of q^2, (K, 3)
+        more = np.tensordot((factors - 1.0) * self._walk.sizes**2, self._paths, axes=1)
+        _, estimates, sigmas = self._solved(self._used + more[:, None])
+        return (estimates - about) / taken, sigmas / taken
+
+    def _of_scatter(self) -> tuple[Floats, Floats, Floats]:
+        """Return weights (N,), estimates (N, p) and sigmas (N, p) for sizes of scatter and setting error."""
         coarse = np.geomspace(_LEAST, _MOST, _COARSE)
         axes = [coarse] * len(self._units)
         logs, *_ = self._at(axes)
@@ -104,7 +133,7 @@ class _Means:
             axes[k] = np.geomspace(coarse[first], coarse[last], _FINE) if last > first else coarse[:1]
         logs, estimates, sigmas = self._at(axes)
         weights = np.exp(logs - logs.max()) * _prior_of(axes)
-        return _half_lengths(weights / weights.sum(), (estimates - about) / taken, sigmas / taken)
+        return weights / weights.sum(), estimates, sigmas
 
     def _at(self, axes: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
         """Return log likelihoods (N,), estimates (N, p) and sigmas (N, p) at all combinations of sizes, and none."""
@@ -133,11 +162,6 @@ def _jacobian(state: Floats) -> Floats:
     jacobian = np.eye(len(state))
     jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(state[:STATE_COUNT])
     return jacobian
-
-
-def _path(ends_s: Floats) -> Floats:
-    """Return the covariance (1, 3 D, 3 D) of the means of walking biases that are known at the end, per q^2."""
-    return np.asarray(np.kron(known_at_end(ends_s), np.eye(3))[None], float)
 
 
 def _whole(blocks: Floats) -> Floats:

@@ -238,7 +238,7 @@ def _begun(
     parameters alone."""
     if model.bench.angles:
         dwells = with_own_noise(dwells)
-        within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(walk_mps2_per_sqrt_s))
+        within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(np.full(3, walk_mps2_per_sqrt_s)))
         return Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
@@ -259,7 +259,7 @@ def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: flo
     noise = within.with_terms(
         SettingError(ATTITUDE_UNKNOWN_RAD, stated=True),
         Scatter(np.full(3, stated or 0.0), stated=stated is not None),
-        RandomWalk(walk_mps2_per_sqrt_s),
+        RandomWalk(np.full(3, walk_mps2_per_sqrt_s)),
     )
     bare = Model(bench, square=tuple(SQUARE))
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
@@ -296,7 +296,7 @@ def _left_to_settle(fitted: Fit, state: Floats) -> float:
 def _moved_to(fitted: Fit, model: Model, state: Floats) -> LinearisedDwells:
     """Return the dwells linearised at a state; nearer where attitudes are not known and the misfit would grow."""
     linearised, noise = fitted.linearised, fitted.noise
-    if model is linearised.model and noise.attitude_unknown and not noise.walk_mps2_per_sqrt_s:
+    if model is linearised.model and noise.attitude_unknown and not noise.walk.steps:
         return descended(linearised, noise, state, lambda there: _misfit(replace(fitted, linearised=there)))
     return relinearised(linearised, noise, model, state)
 

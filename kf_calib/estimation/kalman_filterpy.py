@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
@@ -154,7 +154,7 @@ def estimate(
         kf.set_noise(piece.sigma_mps2)
         observations = np.concatenate([piece.observation / scale, piece.nuisances], axis=2)
         for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
-            if noise.walk_mps2_per_sqrt_s and now_s > previous_s:
+            if noise.walk.steps and now_s > previous_s:
                 kf.walk(noise.walk_mps2_per_sqrt_s**2 * (now_s - previous_s))
             previous_s = now_s
             nis += kf.update(observation, reading)
@@ -227,10 +227,10 @@ class _Filter:
         )
         matrix[nuisances, nuisances] = np.eye(len(self.kf.x) - self.count)
 
-    def walk(self, variance: float) -> None:
-        """Do a time update with F = I in which the biases take steps of this variance."""
+    def walk(self, variances: Floats) -> None:
+        """Do a time update with F = I in which the biases take steps of these variances (3,)."""
         steps = np.zeros(len(self.kf.x))
-        steps[3:STATE_COUNT:4] = variance
+        steps[BIASES] = variances
         if self.plain:
             self.kf.Q = np.diag(steps)
         else:

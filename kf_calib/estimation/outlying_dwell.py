@@ -40,7 +40,7 @@ def outlying_dwells(result: Calibration, evaluate: Callable[[DwellTable], Calibr
     makes a calibration from some of the dwells with the same model.
     """
     left_out, dwells, wrong = result.held_out, result.fit.dwells, list[OutlyingDwell]()
-    if left_out is None or not result.bench.angles or result.noise.walk_mps2_per_sqrt_s:
+    if left_out is None or not result.bench.angles or result.noise.walk.steps:
         return ()
     ratios = (left_out.statistics / left_out.statistics.max()).round(9)  # the first of equal dwells comes first
     for k in np.argsort(-ratios, kind="stable").tolist():

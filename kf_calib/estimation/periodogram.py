@@ -189,8 +189,8 @@ class _Path:
     def _bands(self, steps: Floats) -> Floats:
         """Return the precision as bands (7, 6 D).
 
-        The step s within a dwell has the variance ``steps[:, 1]``. The next a is a + s plus the step in the pause, of
-        variance ``steps[:, 0]``.
+        The step s within a dwell has the variances ``steps[:, 1]``. The next a is a + s plus the step in the pause, of
+        variances ``steps[:, 0]``.
         """
         count = len(steps)
         bands = np.zeros((7, count, 6))
@@ -199,14 +199,14 @@ class _Path:
             for apart in range(6):
                 bands[apart, k, : 6 - apart] = np.diag(own, -apart)
         within, pauses = 1.0 / steps[:, 1], 1.0 / np.maximum(steps[1:, 0], SEEN)
-        bands[0, :, 3:] += within[:, None]
+        bands[0, :, 3:] += within
         bands[0, 0, :3] += 1.0  # the first a is fixed at zero; 1 keeps the matrix regular
-        bands[0, 1:, :3] += pauses[:, None]
-        bands[0, 1:-1, :3] += pauses[1:, None]
-        bands[0, :-1, 3:] += pauses[:, None]
-        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell, whose sum leads to the next a
-        bands[3, :-1, 3:] -= pauses[:, None]  # s and the next a
-        bands[6, 1:-1, :3] -= pauses[1:, None]  # a and the next a
+        bands[0, 1:, :3] += pauses
+        bands[0, 1:-1, :3] += pauses[1:]
+        bands[0, :-1, 3:] += pauses
+        bands[3, 1:-1, :3] += pauses[1:]  # a and s of one dwell, whose sum leads to the next a
+        bands[3, :-1, 3:] -= pauses  # s and the next a
+        bands[6, 1:-1, :3] -= pauses[1:]  # a and the next a
         return bands.reshape(7, -1)
 
 

@@ -12,7 +12,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells import window_average
 from kf_calib.effects import Effect, remarks_of
-from kf_calib.effects.effect import Unknown
+from kf_calib.effects.effect import Coefficient, Unknown
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate
@@ -21,7 +21,7 @@ from kf_calib.estimation.results import Consistency, format_p
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course
-from kf_calib.noise.terms import ThermometerError
+from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.noise.within_dwells import TOO_SHORT
 from kf_calib.support.units import shown
 
@@ -84,6 +84,8 @@ def remarks_on(
             "readings and angles recorded all through the motions, angles at least every half second."
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
+    if model.intensity is not None and not noise.walk.is_alike:
+        yield _on_walks(noise.walk, model.intensity)
     if noise.term(ThermometerError) is not None:
         left_c = np.sqrt(np.mean(np.sum(temperature_course(dwells.folded).errors_c ** 2, axis=1)))
         yield (
@@ -179,6 +181,17 @@ def _scatter_in_words(noise: Noise, freedom: int) -> str:
         return size
     percent = 100.0 * math.sqrt(0.5 / max(freedom, 1))
     return f"{size}, itself uncertain by {percent:.0f} % with {freedom} degree{'s' * (freedom != 1)} of freedom"
+
+
+def _on_walks(walk: RandomWalk, intensity: Coefficient) -> str:
+    """Return a remark on biases that walk by another amount each."""
+    unit, walking = shown(intensity), np.flatnonzero(walk.spreads)
+    sizes = [f"{unit.text(float(walk.sizes[k]), 2)} in accelerometer {k + 1}" for k in walking]
+    still = " and ".join(str(k + 1) for k in range(3) if k not in walking)
+    rest = f"; in accelerometer {still} no walk is seen" if still else ""
+    return (
+        f"the biases do not walk alike: by {' and '.join(sizes)}{rest}. {intensity.symbol} is their root mean square."
+    )
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:

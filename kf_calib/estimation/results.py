@@ -269,8 +269,8 @@ class Calibration:
         ]
         units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if (walk := self.model.intensity) is not None:
-            intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk.spread
-            rows.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
+            intensity, spread = self.noise.walk.rms_mps2_per_sqrt_s, self.noise.walk.spread
+            rows.append((walk.symbol, intensity, intensity * spread or math.nan, 0.0, walk.unit))
             units.append((walk.shown_unit, walk.per_si))
         for effect in self.model.constants_beside_state:
             assert effect.unknown is not None

@@ -24,7 +24,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 
-_STILL = np.zeros(2)
+_STILL = np.zeros((2, 3))
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Float
 
       without a walk: QR of [R | z] stacked on the rows gives [R+ | z+] stacked on [0 | e],  NIS = e' e
 
-    ``walked`` (2,) are the variances of the biases' steps in the pause before the dwell and within the dwell.
+    ``walked`` (2, 3) are the variances of the biases' steps in the pause before the dwell and within the dwell.
     """
     width, (upper, count) = len(factor), random_walk.advance(factor, walked, rows)
     left = upper[count + width :, -1]
@@ -100,7 +100,7 @@ def run(
 
     - first: the factor of the prior.
     - rows: the whitened rows of each dwell.
-    - walked: the variances (2,) of the biases' steps before and within each dwell.
+    - walked: the variances (2, 3) of the biases' steps before and within each dwell.
     - following: the whitened rows of the slew after each dwell, which may be empty.
 
     A step's factor is the one after the slew; its innovation is that of the dwell alone.
@@ -122,8 +122,8 @@ def accumulate(rows: Sequence[Floats], walked: Floats | None = None, first: Floa
     """Triangular factor [H | z] of all rows and of those of a prior, ``first``, which is diffuse without; the last row
     holds the norm of the residual.
 
-    ``walked`` (D, 2) are the variances of the biases' steps before and within each dwell; the dwells' rows are the last
-    D in ``rows``. Without a walk all rows are reduced by one QR.
+    ``walked`` (D, 2, 3) are the variances of the biases' steps before and within each dwell; the dwells' rows are the
+    last D in ``rows``. Without a walk all rows are reduced by one QR.
     """
     if walked is None or not walked.any():
         stacked = rows[0] if len(rows) == 1 else of_all_pieces(rows)
@@ -132,7 +132,7 @@ def accumulate(rows: Sequence[Floats], walked: Floats | None = None, first: Floa
         return triangle(np.vstack([stacked, np.zeros((lacking, stacked.shape[1]))]) if lacking else stacked)
     rows, width = rows if first is None else [first, *rows], rows[-1].shape[1] - 4
     factor, left = np.zeros((width, width + 1)), 0.0
-    padded = np.vstack([np.zeros((len(rows) - len(walked), 2)), walked])
+    padded = np.concatenate([np.zeros((len(rows) - len(walked), 2, 3)), walked])
     for own, variances in zip(rows, padded, strict=True):
         upper, count = random_walk.advance(factor, variances, own)
         factor, left = upper[count : count + width, count:], np.hypot(left, np.linalg.norm(upper[count + width :, -1]))

@@ -152,7 +152,7 @@ class _Batch:
     def tells_means_only(self, columns: Floats, about: _About) -> bool:
         """Whether only the mean of each dwell tells something of the states, so that whitened rows have full rank:
         nothing else is known, or the columns (pieces, K, 3, p) and what errors change are constant within each."""
-        if about.noise.walk_mps2_per_sqrt_s or about.noise.attitude_unknown:
+        if about.noise.walk.steps or about.noise.attitude_unknown:
             return False
         if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.table.folded.width].any():
             return True

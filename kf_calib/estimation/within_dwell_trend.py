@@ -123,7 +123,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     squares, determined = _squares(dwells, _residuals(linearised, state))
     by_readings = (sigma**2 / (folded.weights * folded.counts[:, None]))[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
-    by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
+    by_walk = noise.walk_mps2_per_sqrt_s[:, None] ** 2 * lengths_s[:, None, None] * walk_shapes
     by_noise = by_readings + by_walk + noise.scatter.flicker_mps2(len(dwells))[:, None] ** 2 * flicker_shapes
     expected = by_noise + _by_thermometer(linearised, noise)
     ratios = np.where(determined[:, None, :], squares / expected, 0.0)
@@ -131,14 +131,14 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     if not count:
         return None
     unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
-    unsure += (2.0 * (noise.walk.spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
+    unsure += (2.0 * noise.walk.spread * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)
     log_density = _log_density(
         squares[shown],
         (expected - by_walk)[shown],
         np.broadcast_to(by_walk, squares.shape)[shown],
-        noise.walk.spread or 0.0,
+        noise.walk.spread,
     )
     return Trend(ratio, f_tail(count, 2.0 / unsure, ratio), ratios.sum(axis=2), folded.numbers, log_density)
 

@@ -218,7 +218,8 @@ def _saved(result: Calibration, recording: str, sha256: str | None, began: datet
             dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter.stated,
             angle_sigma_deg=0.0 if noise.attitude_unknown else math.degrees(noise.setting_rad),
             angle_sigma_stated=noise.setting.stated and not noise.attitude_unknown,
-            walk_mps2_per_sqrt_s=float(noise.walk_mps2_per_sqrt_s),
+            walk_mps2_per_sqrt_s=noise.walk.rms_mps2_per_sqrt_s,
+            walk_of_each_mps2_per_sqrt_s=noise.walk_mps2_per_sqrt_s.tolist(),
         ),
         consistency=SavedConsistency(
             consistent=judged.consistent, p_value=judged.p_value, nis_per_dof=judged.nis_per_dof, dof=judged.dof,

@@ -95,6 +95,7 @@ class SavedNoise(FilePart):
     angle_sigma_deg: Positive
     angle_sigma_stated: bool
     walk_mps2_per_sqrt_s: Positive
+    walk_of_each_mps2_per_sqrt_s: Three | None = None
 
 
 class SavedConsistency(FilePart):

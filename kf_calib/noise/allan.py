@@ -33,7 +33,7 @@ class AllanDeviation:
     - spread (m,): its relative sigma, 1/sqrt(2 (clusters - 1)).
     - white_mps2 (m, 3): of white noise as the filter has it, sigma_w sqrt(kappa / m).
     - flicker_mps2 (3,): of 1/f noise that would give the scatter between dwells, sqrt(2 h ln 2); 0 without scatter.
-    - walk_mps2 (m,): of the random walk of a bias, q sqrt(tau / 3); 0 without a walk.
+    - walk_mps2 (m, 3): of the random walk of each bias, q sqrt(tau / 3); 0 without a walk.
     """
 
     dwells: tuple[int, ...]
@@ -124,9 +124,9 @@ class LongestDwells:
 
 
 def model_lines(noise: Noise, sizes: Floats, tau_s: Floats, dwells: int) -> tuple[Floats, Floats, Floats]:
-    """What white noise (m, 3), 1/f noise (3,) and the walk (m,) of a noise model give of the Allan deviation."""
+    """What white noise (m, 3), 1/f noise (3,) and the walk (m, 3) of a noise model give of the Allan deviation."""
     return (
         noise.effective_sigma_mps2 / np.sqrt(sizes)[:, None],
         np.sqrt(2.0 * np.log(2.0)) * noise.scatter.flicker_mps2(dwells),
-        noise.walk_mps2_per_sqrt_s * np.sqrt(tau_s / 3.0),
+        noise.walk_mps2_per_sqrt_s * np.sqrt(tau_s / 3.0)[:, None],
     )

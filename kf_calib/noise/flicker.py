@@ -30,7 +30,7 @@ def with_waves_in_dwells(noise: Noise, dwells: Sequence[Dwell], columns: Sequenc
     model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
     table = DwellTable.of(dwells)
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or table.folded.carrier_hz:
+    if not noise.scatter_mps2.any() or noise.walk.steps or table.folded.carrier_hz:
         return noise
     if table.folded.shows_means_only:
         return noise

@@ -96,9 +96,9 @@ class Noise:
         return self.scatter.sizes_mps2
 
     @property
-    def walk_mps2_per_sqrt_s(self) -> float:
-        """The intensity q of the random walk of each bias."""
-        return self.walk.intensity_mps2_per_sqrt_s
+    def walk_mps2_per_sqrt_s(self) -> Floats:
+        """The intensities q (3,) of the random walks of the biases."""
+        return self.walk.intensities_mps2_per_sqrt_s
 
     @property
     def attitude_unknown(self) -> bool:
@@ -168,7 +168,7 @@ class Noise:
 
 
 def steps(dwells: Sequence[Dwell], noise: Noise) -> Floats:
-    """Variances (D, 2) of the steps of a bias in the pause before each dwell and over the dwell."""
+    """Variances (D, 2, 3) of the steps of the biases in the pause before each dwell and over the dwell."""
     ends = DwellTable.of(dwells).folded.ends_s
     return random_walk.variances(ends[:, 0], ends[:, 1], noise.walk_mps2_per_sqrt_s)
 

@@ -48,14 +48,14 @@ def known_at_end(ends_s: Floats) -> Floats:
     return np.asarray(np.minimum.outer(before_end_s, before_end_s), float)
 
 
-def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:
-    """Variances (D, 2) of a bias's steps in the pause before each dwell and over the dwell."""
+def variances(begins_s: Floats, ends_s: Floats, intensities: Floats) -> Floats:
+    """Variances (D, 2, 3) of the steps of the biases in the pause before each dwell and over the dwell."""
     pauses = np.maximum(np.append(0.0, begins_s[1:] - ends_s[:-1]), 0.0)
-    return intensity**2 * np.column_stack([pauses, ends_s - begins_s])
+    return np.column_stack([pauses, ends_s - begins_s])[:, :, None] * intensities**2
 
 
 def to_mean(steps: Floats) -> Floats:
-    """Variance (D,) of the change from the bias at the end of a dwell to its mean over the next dwell."""
+    """Variances (D, 3) of the change from the biases at the end of a dwell to their means over the next dwell."""
     return steps[:, 0] + steps[:, 1] / 3.0
 
 
@@ -67,7 +67,7 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     valid for a singular factor, too.
 
     - factor (p, p + 1): [R | z] with the biases at the end of the dwell before.
-    - steps (2,): variances of each bias's step in the pause and within the dwell.
+    - steps (2, 3): variances of the steps of the biases in the pause and within the dwell.
     - rows (m, 3 + p + 1): [S | H | z], where S are the columns of the steps within the dwell; S is absent without a
       walk.
     """
@@ -109,8 +109,7 @@ def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
 def _sigmas(steps: Floats, inside: int) -> Floats:
     """Return the sigmas of the steps w in their order: three within the dwell if its rows have columns for them, three
     in the pause."""
-    variances = ([steps[1]] if inside else []) + ([steps[0]] if steps[0] > 0 else [])
-    return np.sqrt(np.repeat(variances, 3))
+    return np.sqrt(np.concatenate([steps[1] if inside else steps[:0, 0], steps[0] if steps[0].any() else steps[:0, 0]]))
 
 
 def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
@@ -125,16 +124,16 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
     above, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
     upper, right, innovations = np.zeros((0, 3)), np.zeros((0, dwells[0].shape[1] - 3)), list(above)
     for of_dwell, (pause, inside) in zip(dwells, steps, strict=True):
-        unknown = ([pause] if pause > 0 and len(upper) else []) + ([inside] if len(upper) else [])
+        unknown = ([pause] if pause.any() and len(upper) else []) + ([inside] if len(upper) else [])
         first, count = 3 * len(unknown), 3 * len(unknown) + len(upper)
         biases = of_dwell[:, 3:][:, BIASES]
         design = np.zeros((count + len(of_dwell) + (0 if len(upper) else 3), first + 3))
-        design[:first, :first] = np.diag(np.repeat(1.0 / np.sqrt(unknown), 3))
+        design[:first, :first] = np.diag(1.0 / np.sqrt(np.ravel(unknown)))
         if len(upper):  # the path before is w less the steps in the pause and in the dwell
             design[first:count] = np.hstack([-upper] * len(unknown) + [upper])
             design[count:] = np.hstack([np.zeros((len(of_dwell), first - 3)), of_dwell[:, :3], biases])
         else:  # in the first dwell the path is the step within it
-            design[:3], design[3:] = np.eye(3) / np.sqrt(inside), of_dwell[:, :3] + biases
+            design[:3], design[3:] = np.diag(1.0 / np.sqrt(inside)), of_dwell[:, :3] + biases
         sides = np.zeros((len(design), right.shape[1]))
         sides[first:count], sides[len(design) - len(of_dwell) :] = right, of_dwell[:, 3:]
         turned, triangular = np.linalg.qr(design, mode="complete")
@@ -144,9 +143,9 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
     return np.concatenate(innovations)
 
 
-def predict(factor: Floats, variance: float) -> Floats:
-    """Time update alone: the factor after a step of this variance in each of the three biases; unchanged if it is 0."""
-    if variance <= 0:
+def predict(factor: Floats, variances: Floats) -> Floats:
+    """Time update alone: the factor after steps of the biases of these variances (3,); unchanged if they are 0."""
+    if not variances.any():
         return factor
-    upper, count = advance(factor, np.array([variance, 0.0]), np.zeros((0, factor.shape[1])))
+    upper, count = advance(factor, np.array([variances, np.zeros(3)]), np.zeros((0, factor.shape[1])))
     return upper[count : count + len(factor), count:]

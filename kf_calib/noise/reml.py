@@ -38,10 +38,14 @@ FEWEST = 6
 ENOUGH_DIRECTIONS = 12
 """With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
-_WALK = 0.5  # a walk has to gain at least this much log-likelihood
+_WALK = 0.5  # what each size of a walk has to gain at least, in log-likelihood
+_STANDS = 1e-3  # intensity of a bias that stands, relative to one that walks: without steps a factor would be singular
 
-Part = Literal["setting", "common", "scatter", "walk", "first", "second", "third"]
+Part = Literal["setting", "common", "scatter", "walk", "walks", "first", "second", "third"]
 Parts = tuple[Part, ...]
+
+WALKS: Parts = ("walk", "walks")
+"""A random walk of one intensity, and of one for each accelerometer."""
 
 OF_ONE: Parts = ("first", "second", "third")
 """The scatter of one accelerometer alone, as of a bad contact; "scatter" is that of each, "common" one of all."""
@@ -102,31 +106,31 @@ class _FreeScatter:
         return Scatter(sizes @ self._members)
 
 
-class _FreeWalk:
+class _FreeWalk(_FreeScatter):
     """Its covariance is that of the path, which links each dwell to the next (``random_walk.mean_links``)."""
-
-    count = 1
 
     def units(self, means: Means, misfit_mps2: Floats) -> Floats:
         span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
-        return np.full(1, 2.0 * misfit_mps2.mean() / math.sqrt(span_s))
+        return 2.0 * super().units(means, misfit_mps2) / math.sqrt(span_s)
 
     def shapes(self, means: Means, state: Floats) -> Floats:
-        path = mean_links(means.ends_s)
-        walk = np.zeros((1, len(means.counts), 6, 3))
-        walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
-        walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
+        path, alike = mean_links(means.ends_s), super().shapes(means, state)
+        walk = np.zeros((self.count, len(means.counts), 6, 3))
+        walk[:, :, :3] = path.alone[:, None, None] * alike
+        walk[:, :-1, 3:] = path.beside[:, None, None] * alike
         return walk
 
     def term(self, sizes: Floats) -> NoiseTerm:
-        return RandomWalk(float(sizes[0]))
+        each = sizes @ self._members
+        return RandomWalk(np.maximum(each, _STANDS * each.max()))
 
 
 FREE: Mapping[Part, FreeTerm] = {
     "setting": _FreeSetting(),
     "common": _FreeScatter((0, 1, 2)),
     "scatter": _FreeScatter((0,), (1,), (2,)),
-    "walk": _FreeWalk(),
+    "walk": _FreeWalk((0, 1, 2)),
+    "walks": _FreeWalk((0,), (1,), (2,)),
     **{part: _FreeScatter((k,)) for k, part in enumerate(OF_ONE)},
 }
 
@@ -242,15 +246,17 @@ def _combinations(stated: Noise, walks: bool, free: int) -> list[Parts]:
     if not (setting.considered or scatter.stated or setting.is_unknown):
         scatters.append(("scatter",))
     walking: list[Parts] = [(), ("walk",)] if walks else [()]
+    if walks and not setting.is_unknown:
+        walking.append(("walks",))
     return [setting + scatter + walk for walk, setting, scatter in product(walking, settings, scatters)][1:]
 
 
 def _with_estimates(stated: Noise, likelihood: Likelihood, parts: Parts, sizes: Floats, without: Point) -> Noise:
     """Return the noise with its parts at their likeliest sizes, and what is known of these."""
     noise = _with(stated, parts, np.concatenate([likelihood.units[part] for part in parts]) * sizes)
-    if "walk" in parts:
-        spread = _last_spread(likelihood.of(parts).curvature(sizes))
-        noise = noise.with_terms(replace(noise.walk, spread=spread))
+    if parts[-1] in WALKS:
+        spreads = _spreads(likelihood.of(parts).curvature(sizes))[-FREE[parts[-1]].count :]
+        noise = noise.with_terms(replace(noise.walk, spreads=np.broadcast_to(spreads, 3)))
     if "setting" in parts:
         rest: Parts = tuple(part for part in parts if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
@@ -265,16 +271,15 @@ def _charge(parts: Parts, likelihood: Likelihood) -> float:
 
     A setting error is taken at its likeliest size, however small: left out below a limit, it would be missing in sigma.
     """
-    charges = {"walk": _WALK, "setting": 0.0}
-    return sum(charges.get(part, 0.5 * VARIANCE_SEEN * len(likelihood.units[part])) for part in parts)
+    charges = {"walk": _WALK, "walks": _WALK, "setting": 0.0}
+    return sum(charges.get(part, 0.5 * VARIANCE_SEEN) * len(likelihood.units[part]) for part in parts)
 
 
-def _last_spread(curvature: Floats) -> float:
-    """Return the sigma of the last of some logarithms that were estimated together, from the ``curvature`` of the
-    cost."""
+def _spreads(curvature: Floats) -> Floats:
+    """Return the sigmas (k,) of some logarithms that were estimated together, from the ``curvature`` of the cost."""
     values, vectors = np.linalg.eigh(curvature)
     seen = values > 1e-3  # directions without curvature belong to parts whose estimate is zero
-    return float(np.sqrt(np.sum(vectors[-1, seen] ** 2 / values[seen])))
+    return np.asarray(np.sqrt(np.sum(vectors[:, seen] ** 2 / values[seen], axis=1)), float)
 
 
 def _setting_is_checked(force_mps2: Floats) -> bool:
@@ -356,7 +361,7 @@ def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
 def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state: Floats) -> Likelihood:
     """Return the likelihood of the means, with the parts that may be added."""
     means, count, units = reduced.means, len(reduced.means.counts), _units(reduced.means)
-    standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
+    standing = not (noise.walk.steps or {*WALKS} & {*parts})
     rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     if standing:  # no means are correlated: only their own covariances are kept
@@ -365,16 +370,17 @@ def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state:
         return Likelihood(alone, _scaled(shapes, units), units)
     path = mean_links(means.ends_s)
     rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
-    walk = FREE["walk"].shapes(means, state)
+    walks = FREE["walks"].shapes(means, state)
     alone = Restricted(
         rows.reshape(3 * count, -1),
         reduced.prior,
-        _conditional_covariances(fixed, path) + noise.walk_mps2_per_sqrt_s**2 * walk[0],
+        _conditional_covariances(fixed, path) + np.tensordot(noise.walk_mps2_per_sqrt_s**2, walks, 1),
         (),
     )
     shapes: dict[Part, Floats] = {
-        part: walk if part == "walk" else _conditional_covariances(FREE[part].shapes(means, state), path)
+        part: shape if part in WALKS else _conditional_covariances(shape, path)
         for part in parts
+        for shape in [FREE[part].shapes(means, state)]
     }
     return Likelihood(alone, _scaled(shapes, units), units)
 

@@ -233,23 +233,42 @@ class ThermometerError(NoiseTerm):
 class RandomWalk(NoiseTerm):
     """A random walk of each bias of intensity q, whose standard deviation after the time t is q sqrt(t).
 
-    Its steps are states of the filter (``random_walk``), and no columns. spread: the sigma of ln q; None if q was
-    stated or is zero.
+    Its steps are states of the filter (``random_walk``), and no columns.
+
+    - intensities_mps2_per_sqrt_s (3,): q of each accelerometer; all are zero, or none is.
+    - spreads (3,): the sigmas of their logarithms; zeros where they were stated or are not seen.
     """
 
-    intensity_mps2_per_sqrt_s: float = 0.0
-    spread: float | None = None
+    intensities_mps2_per_sqrt_s: Floats = field(default_factory=lambda: np.zeros(3))
+    spreads: Floats = field(default_factory=lambda: np.zeros(3))
     scope: ClassVar[Scope] = "path"
 
     @property
     def sizes(self) -> Floats:
-        return np.array([self.intensity_mps2_per_sqrt_s])
+        return self.intensities_mps2_per_sqrt_s
+
+    @property
+    def rms_mps2_per_sqrt_s(self) -> float:
+        """The root mean square of the three intensities."""
+        return float(np.sqrt(np.mean(self.sizes**2)))
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether all three are one."""
+        return not np.ptp(self.sizes)
+
+    @property
+    def spread(self) -> float:
+        """The sigma of the logarithm of their root mean square."""
+        if self.is_alike:
+            return float(self.spreads[0])
+        return float(np.linalg.norm(self.sizes**2 * self.spreads) / np.sum(self.sizes**2))
 
     @property
     def steps(self) -> int:
         """Number of columns of the steps that the biases take within a dwell: one for each accelerometer, none where
         they do not walk."""
-        return 3 if self.intensity_mps2_per_sqrt_s else 0
+        return 3 if self.sizes.any() else 0
 
     def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         return np.zeros((dwells.folded.ends[-1], 3, 3, 0))

@@ -31,7 +31,9 @@ correlation."""
 _LONGEST, _SHORT = TOO_SHORT / 2.0, TOO_SHORT * 2.0
 
 
-def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None) -> Noise:
+def within_dwells(
+    dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: Floats | float = 0.0, along: Floats | None = None
+) -> Noise:
     """The noise within dwells, sigma_w and kappa of each accelerometer, pooled over all pieces.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
@@ -42,7 +44,7 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
     """
     table = DwellTable.of(dwells)
     within_seen = bool((table.folded.counts > 1).any())
-    if walk_mps2_per_sqrt_s:
+    if np.any(walk_mps2_per_sqrt_s):
         shares = shares_in_correlation(table.folded) if along is None else table.folded.weights
         inflation, variance = _correlation(table.folded, shares, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
@@ -51,7 +53,7 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
         return Noise(_sigma_along(table, along, inflation), inflation, within_seen=within_seen)
     counts, of_pieces = table.folded.piece_counts, np.repeat(table.folded.weights, table.folded.piece_numbers, axis=0)
     squares = of_pieces * table.folded.squares
-    if walk_mps2_per_sqrt_s:
+    if np.any(walk_mps2_per_sqrt_s):
         rest = of_pieces * np.concatenate([walk.about_parabola for walk in table.folded.walks])[:, None]
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
     on_carrier = table.folded.width - 3
@@ -73,10 +75,12 @@ def _in_the_hand(folded: FoldedDwells) -> tuple[Floats, Floats]:
     return _correlation(folded, folded.weights)
 
 
-def _correlation(folded: FoldedDwells, shares: Floats, walk_mps2_per_sqrt_s: float = 0.0) -> tuple[Floats, Floats]:
+def _correlation(
+    folded: FoldedDwells, shares: Floats, walk_mps2_per_sqrt_s: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells of these shares, less those of a walk."""
     total = pooled_autocovariance(folded, shares)
-    if walk_mps2_per_sqrt_s:
+    if np.any(walk_mps2_per_sqrt_s):
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded, shares))
     known = _of_averages if folded.averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T

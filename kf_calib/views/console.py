@@ -54,7 +54,7 @@ def parameter_row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, s
 
 def parameter_table(result: Calibration) -> ConsoleTable:
     """The table of the twelve parameters: value, deviation from nominal and one sigma."""
-    walking = "; the biases walk: those at the end of the run" if result.noise.walk_mps2_per_sqrt_s else ""
+    walking = "; the biases walk: those at the end of the run" if result.noise.walk.steps else ""
     twelve = list(result.parameters.values())[:12]
     return table_of_parameters(f"Parameters (1σ{walking})", twelve, result.fixed)
 

@@ -28,7 +28,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "model": [str(effect) for effect in result.model.effects],
             "parameters": parameters_object(result),
             "frame": frame_object(result),
-            "biases_at_s": dwells[-1].end_s if noise.walk_mps2_per_sqrt_s else None,
+            "biases_at_s": dwells[-1].end_s if noise.walk.steps else None,
             "noise": {
                 "sigma_mps2": noise.sigma_mps2,
                 "inflation": noise.inflation,
@@ -36,6 +36,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 "dwell_sigma_stated": noise.scatter.stated,
                 "angle_sigma_deg": None if noise.attitude_unknown else math.degrees(noise.setting_rad),
                 "angle_sigma_stated": noise.setting.stated and not noise.attitude_unknown,
+                "walk_mps2_per_sqrt_s": noise.walk_mps2_per_sqrt_s,
             },
             "consistency": {
                 "consistent": judged.unconditional,

@@ -125,15 +125,17 @@ def test_the_path_of_a_walk_is_no_residual() -> None:
     """It is the best prediction from the residuals, of steps between the dwells that add up from each to the end."""
     before = noisy_run(dwells=16, walk_mps2_per_sqrt_s=3e-6, seed=4)
     after = Refits().with_effects(before, ("bias-walk",))
-    assert after.noise.walk_mps2_per_sqrt_s > 0.0
+    assert after.noise.walk.steps
     ratios = unexplained_mps2(after) / mean_sigmas(before)
     assert np.sqrt(np.mean(unexplained_mps2(after) ** 2)) < 0.5 * before.residual_rms_mps2
     assert np.sqrt(np.mean(ratios**2)) < 1.5
     assert np.array_equal(unexplained_mps2(before), before.residuals_mps2)
     ends_s = after.linearised.means.ends_s
     steps_s, later = np.diff([*ends_s.mean(axis=1), ends_s[-1, 1]]), np.triu(np.ones((len(ends_s), len(ends_s))))
-    walk = after.noise.walk_mps2_per_sqrt_s**2 * later @ np.diag(steps_s) @ later.T
-    for path, residual, sigma in zip(walk_path(after).T, after.residuals_mps2.T, mean_sigmas(after).T, strict=True):
+    covariance, sizes = later @ np.diag(steps_s) @ later.T, after.noise.walk_mps2_per_sqrt_s
+    each = zip(sizes, walk_path(after).T, after.residuals_mps2.T, mean_sigmas(after).T, strict=True)
+    for size, path, residual, sigma in each:
+        walk = size**2 * covariance
         np.testing.assert_allclose(path, walk @ np.linalg.solve(walk + np.diag(sigma**2), residual), rtol=1e-6)
 
 

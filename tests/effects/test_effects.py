@@ -361,8 +361,8 @@ def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     found, gains = model.natural(estimate.state)
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
     if (walk := model.intensity) is not None:
-        noise = fitted.noise
-        out[walk.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk.spread or np.nan)]
+        size = fitted.noise.walk.rms_mps2_per_sqrt_s
+        out[walk.symbol] = [size, size * (fitted.noise.walk.spread or np.nan)]
     return {symbol: (float(value), float(sigma)) for symbol, (value, sigma) in out.items()}
 
 
@@ -484,7 +484,7 @@ def test_a_running_filter_is_a_refit_whatever_it_carries(
 ) -> None:
     """At any dwell, with any effects in its model and those of the catalogue carried beside it."""
     dwells, noise, state = navigation
-    noise = noise.with_terms(RandomWalk(walk))
+    noise = noise.with_terms(RandomWalk(walk * np.array([1.0, 0.5, 2.0])))
     for names_in in models:
         model = Model.of(BENCH, names_in)
         others = [effect_named(name, BENCH) for name in NAMES if name not in names_in]

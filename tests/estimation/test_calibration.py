@@ -62,14 +62,14 @@ def test_misfit_beside_a_walk_and_a_stated_scatter_is_that_of_all_steps_solved_t
     fitted = Refits().with_effects(before, ("bias-walk",)).fit
     rows, count = fitted.misfit_rows, len(fitted.dwells)
     prior, dwells = np.vstack(rows[:-count]), rows[-count:]
-    assert len(prior) and fitted.noise.walk_mps2_per_sqrt_s > 0.0 and prior.shape[1] == dwells[0].shape[1] - 3
-    steps = fitted.steps.ravel()  # in the pause before each dwell, and within it
+    assert len(prior) and fitted.noise.walk.steps and prior.shape[1] == dwells[0].shape[1] - 3
+    steps = fitted.steps.reshape(-1, 3)  # in the pause before each dwell, and within it
     joint = [np.hstack([np.zeros((len(prior), 3 * len(steps))), prior])]
     for k, own in enumerate(dwells):
         later = np.zeros((len(own), len(steps), 3))
         later[:, 2 * k + 2 :] = -own[:, 3:][:, None, BIASES]  # the state has the biases at the end of the run
         later[:, 2 * k + 1] = own[:, :3]
-        joint.append(np.hstack([(later * np.sqrt(steps)[:, None]).reshape(len(own), -1), own[:, 3:]]))
+        joint.append(np.hstack([(later * np.sqrt(steps)).reshape(len(own), -1), own[:, 3:]]))
     joint.append(np.eye(3 * len(steps), joint[0].shape[1]))
     design = np.vstack(joint)
     columns = design[:, :-1] / np.linalg.norm(design[:, :-1], axis=0)
@@ -269,7 +269,7 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     assert len({len(dwell.pieces) for dwell in dwells}) > 1
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
-    for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.full(3, 1e-5)), RandomWalk(1e-5))):
+    for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.full(3, 1e-5)), RandomWalk(np.full(3, 1e-5)))):
         together = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
         for k, (own, rows) in enumerate(zip(columns, together, strict=True)):
             (alone,) = whitened_rows.whiten(dwells[k : k + 1], [own], noise, state, reduced=False)

@@ -30,7 +30,7 @@ def test_few_frequencies_are_computed_themselves() -> None:
 def test_what_a_walk_explains_is_that_of_its_covariance() -> None:
     """x - C (C^T C + Q^-1)^-1 C^T x = (1 + C Q C^T)^-1 x, with Q the covariance of sums of independent steps."""
     rng, dwells, height = np.random.default_rng(6), 5, 4
-    rows, steps = rng.normal(size=(dwells * height, 3 + 13)), rng.uniform(0.2, 2.0, size=(dwells, 2))
+    rows, steps = rng.normal(size=(dwells * height, 3 + 13)), rng.uniform(0.2, 2.0, size=(dwells, 2, 3))
     ends = list(range(0, dwells * height + 1, height))
     path, expected = _Path(rows, ends, steps), np.eye(len(rows))
     for axis in range(3):
@@ -42,7 +42,7 @@ def test_what_a_walk_explains_is_that_of_its_covariance() -> None:
                 effect[part, k, 0] = bias[part] if k else 0.0
                 effect[part, k, 1] = bias[part] + (inside[part] if d == k else 0.0)
         flat = effect.reshape(len(rows), -1)
-        expected += flat * steps.ravel() @ flat.T
+        expected += flat * steps[:, :, axis].ravel() @ flat.T
     columns = rng.normal(size=(len(rows), 3))
     freed = np.linalg.solve(expected, columns)
     np.testing.assert_allclose(path.freed(columns), freed, rtol=1e-9, atol=1e-12)

@@ -92,7 +92,8 @@ def test_engines_and_batch_agree() -> None:
 def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mps2: float) -> None:
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
     effects = [effect_named("sinusoid", BENCH).at(value) for value in np.linspace(0.01, 0.5, 20)]
-    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), RandomWalk(walk_mps2))
+    walk = RandomWalk(walk_mps2 * np.array([1.0, 0.5, 2.0]))
+    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), walk)
     expected = scan(fitted.linearised, noise, effects).statistics
     assert expected.max() > 10.0
     np.testing.assert_allclose(delta_chi2(fitted.linearised, noise, effects), expected, rtol=1e-6, atol=1e-6)
@@ -103,7 +104,8 @@ def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mp
 def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float, walk_mps2: float) -> None:
     """Interpolated between a few frequencies, beside two models, against every frequency worked out."""
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
-    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), RandomWalk(walk_mps2))
+    walk = RandomWalk(walk_mps2 * np.array([1.0, 0.5, 2.0]))
+    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), walk)
     values = np.linspace(0.01, 0.5, 400)
     twelve = LinearisedDwells(
         fitted.dwells, fitted.linearised.model - fitted.linearised.model.effects[0], fitted.linearised.state[:12]

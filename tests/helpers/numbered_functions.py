@@ -65,11 +65,11 @@ def noises() -> Numbers:
     series = [np.cumsum(rng.normal(size=(count, 3)), axis=0) for count in (300, 500)]
     sizes = allan.cluster_sizes(300)
     ends = np.cumsum(rng.uniform(1.0, 9.0, 24)).reshape(12, 2)
-    steps, rows = rng.uniform(0.0, 1.0, (12, 2)), [rng.normal(size=(6, 16)) for _ in range(12)]
+    steps, rows = np.repeat(rng.uniform(0.0, 1.0, (12, 2, 1)), 3, axis=2), [rng.normal(size=(6, 16)) for _ in range(12)]
     links = [random_walk.mean_links(ends)]
     whitened, factor = random_walk.whiten_walk(rows, steps), np.triu(rng.normal(size=(12, 13)))
     advanced = [random_walk.advance(factor, steps[0], rows[0])[0], random_walk.recede(factor, steps[0], rows[0])]
-    advanced += [random_walk.predict(factor, variance) for variance in (0.0, 0.4)]
+    advanced += [random_walk.predict(factor, np.full(3, variance)) for variance in (0.0, 0.4)]
     freedom = np.full((3, 30), 40.0)
     variances = [rng.chisquare(40.0, (3, 30)) / 40.0 * np.exp(size * rng.normal(size=30)) for size in (0.0, 0.1, 1.0)]
     columns = 0.1 * rng.normal(size=(10, 6, 3))
@@ -81,7 +81,7 @@ def noises() -> Numbers:
         unbiased=[noise_of_readings.unbiased(gamma, 200, 100) for gamma in gammas],
         products=[noise_of_readings.expected_products(gamma, 6) for gamma in gammas],
         allan=allan.deviations(series, sizes), sizes=[allan.cluster_sizes(count) for count in (1, 7, 64, 1000)],
-        links=links, walked=random_walk.variances(ends[:, 0], ends[:, 1], 0.3), to_mean=random_walk.to_mean(steps),
+        links=links, walked=random_walk.variances(ends[:, 0], ends[:, 1], np.full(3, 0.3)), to_mean=random_walk.to_mean(steps),
         whitened=np.abs(whitened.T @ whitened), advanced=[np.abs(each.T @ each) for each in advanced],
         weights=[noise_of_readings.weights_of(each, freedom) for each in variances],
         bands=[lower, banded.diagonal(lower), banded.solve(lower, rng.normal(size=(30, 2)))],

@@ -7,7 +7,7 @@ import pytest
 from helpers.long_runs import slow
 from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import binom, chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
@@ -24,12 +24,12 @@ from kf_calib.noise.terms import RandomWalk, SettingError
 Q = 1e-5
 
 
-def walking(seed: int, intensity: float = Q, **options: object) -> Run:
+def walking(seed: int, intensity: float | Floats = Q, **options: object) -> Run:
     """A run whose biases walk from reading to reading, through the pauses as well; ``biases`` are those at its end."""
     made = Run(seed=seed, white_mps2=5e-5, **options)  # type: ignore[arg-type]
     rng, time_ns = np.random.default_rng([seed, 1]), made.accel.time_ns
     deltas = np.diff(time_ns * 1e-9, prepend=time_ns[0] * 1e-9)
-    path = np.cumsum(rng.normal(size=(len(time_ns), 3)) * intensity * np.sqrt(deltas)[:, None], axis=0)
+    path = np.cumsum(rng.normal(size=(len(time_ns), 3)) * np.sqrt(deltas)[:, None], axis=0) * intensity
     made.accel = Stream(time_ns, made.accel.values + path)
     made.truth[3::4] += path[-1]
     return made
@@ -90,11 +90,11 @@ def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
     values = []
     for q in (0.3 * Q, Q, 3.0 * Q):
         noise = result.noise.without(RandomWalk)
-        full = q**2 * np.kron(kernel, np.eye(3))
+        full = q**2 * np.kron(kernel, np.diag([1.0, 4.0, 0.25]))
         for k, own in enumerate(mean_covariances(noise, means, state)):
             full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
         expected = multivariate_normal(cov=rest.T @ full @ rest).logpdf(rest.T @ means.readings.ravel())
-        found = restricted_log_likelihood(noise.with_terms(RandomWalk(q)), means, state)
+        found = restricted_log_likelihood(noise.with_terms(RandomWalk(q * np.array([1.0, 2.0, 0.5]))), means, state)
         values.append((expected, found))
     differences = np.diff(np.array(values), axis=0)
     np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)
@@ -104,7 +104,7 @@ def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
 def test_the_likelihood_of_a_walk_is_there_however_large_a_setting_error_is_tried_beside_it(setting_deg: float) -> None:
     """No rotation changes a reading along the force: there the covariance is that of the noise, or of rounding."""
     result = calibrate(Run(seed=3, dwells=24, count=60, white_mps2=1e-6))
-    noise = result.noise.with_terms(SettingError(np.radians(setting_deg)), RandomWalk(1e-9))
+    noise = result.noise.with_terms(SettingError(np.radians(setting_deg)), RandomWalk(np.full(3, 1e-9)))
     assert np.isfinite(restricted_log_likelihood(noise, result.linearised.means, result.linearised.state))
 
 
@@ -147,7 +147,7 @@ def dense(result: Calibration) -> Floats:
     middle = 0.5 * (starts + ends) - starts[0]
     kernel = np.minimum(middle[:, None], middle[None, :])
     np.fill_diagonal(kernel, starts - starts[0] + (ends - starts) / 3.0)
-    full = noise.walk_mps2_per_sqrt_s**2 * np.kron(kernel, np.eye(3))
+    full = np.kron(kernel, np.diag(noise.walk_mps2_per_sqrt_s**2))
     for k, own in enumerate(mean_covariances(noise, means, result.linearised.state)):
         full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
     return full
@@ -172,6 +172,24 @@ def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest(runs: int) -> N
     low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 12 * runs)
     assert low < nees < 1.15 * high  # the intensity is estimated, too
     assert misfit <= max(1, 0.05 * runs)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize(("dwells", "runs"), [(12, 8), *slow((8, 60), (12, 60), (24, 60))])
+def test_intervals_hold_where_biases_walk_by_another_amount_each(dwells: int, runs: int, stated: bool) -> None:
+    """One walks and two stand; those that stand are known as if nothing walked, though nobody said which it is."""
+    inside, one, others = list[bool](), list[float](), list[float]()
+    for seed in range(runs):
+        run = walking(seed, Q * np.array([1.0, 0.0, 0.0]), dwells=dwells, stated=stated)
+        result = fitted(run)
+        ends = [result.interval(each) for each in [*result.parameters.values()][:12]]
+        inside += [low <= truth <= high for (low, high), truth in zip(ends, run.truth, strict=True)]
+        lengths = [ends[k][1] - ends[k][0] for k in (3, 7, 11)]
+        one.append(lengths[0])
+        others += lengths[1:]
+    low, high = binom.ppf([1e-4, 1.0 - 1e-4], 4 * runs, 0.95)  # of three accelerometers at most one is independent
+    assert low / (4 * runs) <= np.mean(inside) <= min(high / (4 * runs), 0.99)
+    assert np.median(others) < 0.3 * np.median(one)
 
 
 def test_no_walk_is_seen_where_there_is_none() -> None:
@@ -212,7 +230,8 @@ def test_rows_whitened_for_a_walk_have_the_gram_matrix_of_dense_noise() -> None:
     """W' W = X' (1 + J V J')^-1 X with J from every step of the biases to every row; one pause lasts no time."""
     rng, dwells, count, width = np.random.default_rng(7), 5, 6, 14
     rows = [rng.normal(size=(count, 3 + width)) for _ in range(dwells)]
-    variances = np.array([(0.5, 0.3), (0.7, 0.2), (0.0, 0.4), (1.1, 0.6), (0.2, 0.1)])  # in the pause before, within
+    spans = np.array([(0.5, 0.3), (0.7, 0.2), (0.0, 0.4), (1.1, 0.6), (0.2, 0.1)])  # in the pause before, within
+    variances = spans[:, :, None] * [1.0, 0.3, 2.0]
     later = np.zeros((dwells * count, 3 * 2 * dwells))
     for d, of_dwell in enumerate(rows):
         of_steps = later[d * count : (d + 1) * count].reshape(count, dwells, 2, 3)
@@ -220,7 +239,7 @@ def test_rows_whitened_for_a_walk_have_the_gram_matrix_of_dense_noise() -> None:
         of_steps[:, 0, 0] = 0.0  # the path begins with the first dwell
         of_steps[:, d, 1] += of_dwell[:, :3]
     columns = np.concatenate(rows)[:, 3:]
-    dense = np.eye(len(columns)) + later @ np.diag(np.repeat(variances.ravel(), 3)) @ later.T
+    dense = np.eye(len(columns)) + later @ np.diag(variances.ravel()) @ later.T
     above = rng.normal(size=(4, width))
     whitened = random_walk.whiten_walk([above, *rows], variances)
     expected = columns.T @ np.linalg.solve(dense, columns) + above.T @ above

@@ -91,7 +91,8 @@ def test_the_reference_filter_allows_for_a_term_that_it_has_never_seen() -> None
 def test_noises_differ_by_which_terms_are_in_the_list() -> None:
     """What was estimated from the misfit does not judge it; a setting error that is considered does not weight."""
     sigma, scatter = np.full(3, 1e-4), Scatter(np.full(3, 1e-5))
-    noise = Noise(sigma, np.ones(3), (SettingError(1e-5), scatter, RandomWalk(1e-6), SlowWaves(sigma)))
+    walk = RandomWalk(np.array([1e-6, 2e-6, 5e-7]))
+    noise = Noise(sigma, np.ones(3), (SettingError(1e-5), scatter, walk, SlowWaves(sigma)))
 
     def kinds(some: Noise) -> set[type[NoiseTerm]]:
         return {type(term) for term in some.terms}

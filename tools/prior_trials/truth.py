@@ -17,7 +17,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.hypothesis_table import PRIOR
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.run_likelihood import RunLikelihood
-from kf_calib.diagnosis.run_terms import _DECADES, RunTerm, RunTerms, _Walk
+from kf_calib.diagnosis.run_terms import _DECADES, EVERY, RunTerm, RunTerms, _Walk
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.table import DwellTable
@@ -110,16 +110,25 @@ class Prior:
                 return [term.effect], _in_all(term, drawn, len(term.effect.coefficients))
             matrix = relations[int(rng.integers(len(relations)))]
             return [term.effect], matrix @ drawn[: matrix.shape[1]]
-        if not term.summands:  # a walk, or biases that come back
-            waves = _Walk(self._dwells[-1].end_s, len(drawn) // 3)
-            return [waves], drawn * (1.0 if term.scales is None else term.scales)
-        unknown = self._terms.unknown[int(term.row[1:])]
+        unknown = self._terms.unknown[int(term.row[1:])] if term.row.startswith("?") else None
+        if unknown is None or not term.summands:
+            return self._waves(rng, term, drawn, unknown is not None and "specific force" in unknown.driver)
         texts = [(text, unknown.weight(k)) for k in term.summands for text in unknown.summands[k]]
         effects = [self._terms.formula_of(text) for text, _ in texts]
         weights = np.repeat([weight for _, weight in texts], [len(effect.coefficients) for effect in effects])
         rms = self._rms(effects)
         drawn = _in_all(term, drawn, len(rms))
         return effects, np.where(rms > 0.0, weights / np.where(rms > 0.0, rms, 1.0), 0.0) * drawn
+
+    def _waves(self, rng: np.random.Generator, term: RunTerm, drawn: Floats, of_scale: bool
+               ) -> tuple[list[Effect], Floats]:  # fmt: skip
+        """Return the waves of a term that is irregular in time, of one accelerometer alone or of all three, and their
+        coefficients. Where each has a size of its own, it is drawn: the term has the likeliest by its readings."""
+        count = len(drawn) if term.only != EVERY else len(drawn) // 3
+        scales = np.ones(len(drawn)) if term.scales is None else term.scales
+        if len(drawn) > count and np.ptp(scales.reshape(3, -1), axis=0).any():
+            scales = np.outer(10.0 ** rng.uniform(-2.0, 0.0, 3), scales.reshape(3, -1).max(axis=0)).ravel()
+        return [_Walk(self._dwells[-1].end_s, count, of_scale)], _in_all(term, drawn * scales, 3 * count)
 
     def _rms(self, effects: Sequence[Effect]) -> Floats:
         """Return the rms (C,) of the columns of effects, in units of the noise, as the terms are scaled."""

@@ -179,4 +179,5 @@ def _lines(axes: Axes, allan: AllanDeviation, i: int) -> None:
         axes.plot(allan.tau_s, np.full(len(allan.tau_s), allan.flicker_mps2[i] * per_si), "--", color="#222222",
                   linewidth=1.2, label="1/f, were it the scatter of dwells")  # fmt: skip
     if allan.walk_mps2.any():
-        axes.plot(allan.tau_s, allan.walk_mps2 * per_si, ":", color="#222222", linewidth=1.4, label="walk, q √(τ/3)")
+        walk = allan.walk_mps2[:, i] * per_si
+        axes.plot(allan.tau_s, walk, ":", color="#222222", linewidth=1.4, label="walk, q √(τ/3)")
