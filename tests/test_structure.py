@@ -215,8 +215,8 @@ accelerometer alone has, for the readings within dwells beside what is fitted, f
 may err, for having no rows within dwells of what is not seen there, and for biases that change smoothly, or each by its
 own size; and with effects for what lags behind anything and the way that gimbals turn. That of sources was raised for
 logs in layouts that their loggers chose, and for objects of many lines. Those of noise, estimation, exchange and views
-were raised for biases that walk by another amount each, and intervals that allow for it. Those of bench, support and dwells were raised
-for numbers that several rooms had each for itself: of rounding, memory, searches and levels."""
+were raised for biases that walk by another amount each, and intervals that allow for it. Those of bench, support and
+dwells were raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 

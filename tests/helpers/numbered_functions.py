@@ -81,7 +81,7 @@ def noises() -> Numbers:
         unbiased=[noise_of_readings.unbiased(gamma, 200, 100) for gamma in gammas],
         products=[noise_of_readings.expected_products(gamma, 6) for gamma in gammas],
         allan=allan.deviations(series, sizes), sizes=[allan.cluster_sizes(count) for count in (1, 7, 64, 1000)],
-        links=links, walked=random_walk.variances(ends[:, 0], ends[:, 1], np.full(3, 0.3)), to_mean=random_walk.to_mean(steps),
+        links=links, walked=random_walk.variances(*ends.T, np.full(3, 0.3)), to_mean=random_walk.to_mean(steps),
         whitened=np.abs(whitened.T @ whitened), advanced=[np.abs(each.T @ each) for each in advanced],
         weights=[noise_of_readings.weights_of(each, freedom) for each in variances],
         bands=[lower, banded.diagonal(lower), banded.solve(lower, rng.normal(size=(30, 2)))],
