@@ -31,6 +31,7 @@ _CAGE = 0.4  # turns of the cage of a bearing in one of the gimbal
 _END = 0.125  # of a run
 _CURVED = ("a*a", "p*p", "a*p", "a*o", "p*o", "abs(a)")  # functions of the force that are not straight
 _LEVELS = (1, 2, 3, 4, 5, 6, 7, 8, 9)  # of the force at which a sensor may behave otherwise, in tenths of gravity
+_IRREGULAR = 24  # half cycles in a run of what turns with time
 _TURNS = 12  # of what oscillates, in a run, at most
 
 
@@ -66,9 +67,10 @@ def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm
     yield from _of_gimbals(len(bench.axes), slow)
     places = _places(bench.angles)
     yield from _of_time(dwells, places)
-    # a slip of the outer gimbal is one of the base, and of the inner one a slip of the mounting
-    slipping = [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in range(2, len(bench.axes))]
-    yield from _of_jumps(dwells, [*places, *(slipping if bench.angles else [])])
+    within = range(2, len(bench.axes) + 1) if bench.angles else ()  # the outer gimbal turns as the base does
+    gimbals = [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in within]
+    yield from _of_turning(dwells, [*(place for place in places if place.turns), *gimbals])
+    yield from _of_jumps(dwells, [*places, *gimbals[:-1]])  # a slip of the inner one is one of the mounting
     yield from _of_arrival(len(bench.axes), dwells)
     yield from _of_way(len(bench.axes), dwells, places)
     yield from _of_history(len(bench.axes), dwells, slow)
@@ -231,8 +233,6 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
     yield _term("time", "bias in time", texts, weights)
     products = [*_with_forces("t"), *(f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7))]
     yield _term("time and specific force", "scale in time", products)
-    for place in (place for place in places if place.turns):
-        yield _term(f"time ({place.words})", place.family, [text for t in texts[:6] for text in place.of([t])], weights)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
     creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *_constants_s(10, dwells[-1].end_s))]
     # between neighbouring frequencies all are sums of these
@@ -244,6 +244,15 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
             yield place.one_of("a creep", [("sqrt(t/s)",), *itertools.pairwise(creeps)])
         if place.lively and oscillations:
             yield place.one_of("an oscillation", oscillations)
+
+
+def _of_turning(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[UnknownTerm]:
+    """What turns with time, smoothly or as irregularly as a random walk, whose spectrum the waves have."""
+    waves = range(1, min(2 * len(dwells), _IRREGULAR) + 1)
+    texts = ["t", "t*t", *(f"cos({n}*pi*t/({dwells[-1].end_s:.0f}*s))" for n in waves)]
+    weights = (1.0, 0.5, *(1.0 / n for n in waves))
+    for place in places:
+        yield _term(f"time ({place.words})", place.family, [place.of([text]) for text in texts], weights)
 
 
 def _of_jumps(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[UnknownTerm]:

@@ -145,7 +145,7 @@ def test_damage_is_told_beside_what_is_there(facts: Any, tmp_path: Path) -> None
         (b"SQLite format 3\0" + bytes(500), "cannot be read as a ROS 2 bag"),
         (b"\x28\xb5\x2f\xfd....", "does not decompress"),
         (b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
-        (b"a,b\n1,2\n", "has no table of three columns, it begins with 'a,b': write a header and a row for each orientation"),
+        (b"a,b\n1,2\n", "has no table of three columns, it begins with 'a,b': write a header and a row for each"),
     ],
 )
 def test_what_cannot_be_read_is_one_sentence(run: Any, tmp_path: Path, content: bytes, says: str) -> None:

@@ -253,7 +253,8 @@ def test_what_changes_smoothly_in_a_way_that_nobody_knows_is_no_walk(seed: int) 
     assert diagnosis.table is not None and diagnosis.table.probability(["bias-walk"]) < 0.5
 
 
-@pytest.mark.parametrize("name", ["a cable winds up", "a gimbal creeps one way", *slow(
+@pytest.mark.parametrize("name", ["a cable winds up", "a gimbal creeps one way", "the block wanders", *slow(
+    "the table wanders", "the zero of an encoder wanders", "the zero of an encoder wanders and comes back",
     "a cable drags", "the table relaxes", "the block sags with the middle gimbal", "switched on again",
     "a scale factor wanders", "a bias turns back", "motors warm the biases", "motors warm the scale factors",
 )])  # fmt: skip

@@ -50,6 +50,12 @@ def _wandering(at: State, rng: np.random.Generator) -> Floats:
     return rng.standard_normal(len(at.time_s)).cumsum()
 
 
+def _returning(at: State, rng: np.random.Generator) -> Floats:
+    """What wanders and comes back, within a small part of the run."""
+    kept = float(np.exp(-at.time_s[1] / (at.time_s[-1] * rng.uniform(0.05, 0.2))))
+    return lfilter([1.0], [1.0, -kept], rng.standard_normal(len(at.time_s)))
+
+
 def _leaning(at: State, rng: np.random.Generator) -> Floats:
     first = rng.integers(3, 15)
     return ((at.dwell >= first) & (at.dwell < first + 4)).astype(float)
@@ -107,13 +113,19 @@ FAULTS: dict[str, tuple[str, Course]] = {
         "gimbals",
         lambda at, rng: np.sign(at.moves_rad[:, 2]) * np.abs(np.sin(at.angles_rad[:, 2])),
     ),
+    "the zero of an encoder wanders": ("gimbals", _wandering),
+    "the zero of an encoder wanders and comes back": ("gimbals", _returning),
     "somebody leans on the table": ("base", _leaning),
     "the table relaxes": ("base", _decay),
+    "the table wanders": ("base", _wandering),
+    "the table wanders and comes back": ("base", _returning),
     "the table tilts with the outer gimbal": ("base", _angle(0, np.cos)),
     "the table is loaded, and relaxes": ("base", _switched_on_again),
     "the table tilts twice a turn": ("base", lambda at, rng: np.cos(2.0 * at.angles_rad[:, 0])),
     "the block slips": ("mount", _from),
     "the block relaxes": ("mount", _decay),
+    "the block wanders": ("mount", _wandering),
+    "the block wanders and comes back": ("mount", _returning),
     "the block sags with the middle gimbal": ("mount", _angle(1, np.sin)),
     "the block wobbles twice a turn": ("mount", lambda at, rng: np.sin(2.0 * at.angles_rad[:, 2] + rng.uniform(0, 6))),
     "a gain switches": ("scale", _from),

@@ -132,8 +132,7 @@ def _full_rows(heading: TextHeading) -> list[list[str]]:
     width, rows = len(heading.header), heading.rows
     if width < _FEWEST:
         begins = f" of three columns, it begins with {cut(heading.delimiter.join(heading.header), 60)!r}" * bool(width)
-        raise InputError(f"has no table{begins}: write a header and a row for each orientation (docs/tables.md), or "
-                         "for each reading (docs/logs.md).")  # fmt: skip
+        raise InputError(f"has no table{begins}: write a header and a row for each orientation (docs/tables.md).")
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"has {width} columns and {len(rows)} rows, more than any table of orientations: leave out "
                          "what is not part of it.")  # fmt: skip
