@@ -5,22 +5,20 @@ scatter, setting errors, and both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated
-from kf_calib.effects import Effect
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import OF_ONE, Parts
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
-_OF_ONE = 0.1  # share of one accelerometer alone in scatter, and of one gimbal alone in setting errors
+_OF_ONE = 0.1  # share of one accelerometer alone in scatter
 INDEPENDENT = 0.5
 """Share of the values that are independent, where dwells differ by more than was stated, or by what no function has."""
 
@@ -33,7 +31,7 @@ _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of 
 class NoiseFamily:
     """Noise of which some parts are free.
 
-    parts: "setting" and "common" (scatter). shapes: covariances (D, 3, 3) per unit of
+    parts: "setting", "common" (scatter) or those of one accelerometer alone. shapes: covariances (D, 3, 3) per unit of
     the squared size, in units of the noise that was stated. log_prior: log of its prior probability.
     """
 
@@ -45,14 +43,11 @@ class NoiseFamily:
 class NoiseSizes:
     """All noises in which a run is weighed.
 
-    noise: what was stated. spare: degrees of freedom that the model leaves of the dwells' means. turns: of each gimbal,
-    by its name.
+    noise: what was stated. spare: degrees of freedom that the model leaves of the dwells' means.
     """
 
-    def __init__(
-        self, likelihood: RunLikelihood, noise: Noise, spare: int, turns: Mapping[str, Effect] = MappingProxyType({})
-    ) -> None:
-        self._likelihood, self._noise, self._spare, self._turns = likelihood, noise, spare, turns
+    def __init__(self, likelihood: RunLikelihood, noise: Noise, spare: int) -> None:
+        self._likelihood, self._noise, self._spare = likelihood, noise, spare
         self._sizes = likelihood.sizes_of_noise()
 
     @cached_property
@@ -73,22 +68,17 @@ class NoiseSizes:
         return families
 
     @cached_property
-    def of_one(self) -> list[tuple[str, NoiseFamily, float]]:
-        """Scatter of one accelerometer alone, and setting errors of one gimbal alone, by name, with their log evidence
-        without any term. They stand against all effects: beside one they would hide what else is missing, which often
-        shows in one accelerometer, or goes with one gimbal."""
+    def of_one(self) -> list[tuple[NoiseFamily, float]]:
+        """Scatter of one accelerometer alone, with its log evidence without any term. It stands against all effects:
+        beside one it would hide what else is missing, which often shows in one accelerometer."""
         if len(self.families) < 2 or self._noise.attitude_unknown:
             return []
-        run, (common, setting) = self._likelihood, self.families[1:3]
-        alone = [(f"accelerometer {k}", common, run.shapes_of(part)) for k, part in enumerate(OF_ONE, start=1)]
-        alone += [(name, setting, shapes) for name, turn in self._turns.items()
-                  if (shapes := run.shapes_along(turn)) is not None]  # fmt: skip
-        evidence = list[tuple[str, NoiseFamily, float]]()
-        for name, of_all, shapes in alone:
-            alike = sum(other is of_all for _, other, _ in alone)
-            family = NoiseFamily(of_all.parts, shapes, of_all.log_prior + math.log(_OF_ONE / alike))
-            logs = run.in_noises(shapes, self.squares).logs[None]
-            evidence.append((name, family, float(self._over_sizes(logs)[0]) + family.log_prior))
+        prior = self.families[1].log_prior + math.log(_OF_ONE / len(OF_ONE))
+        evidence = list[tuple[NoiseFamily, float]]()
+        for part in OF_ONE:
+            shapes = self._likelihood.shapes_of(part)
+            logs = self._likelihood.in_noises(shapes, self.squares).logs[None]
+            evidence.append((NoiseFamily((part,), shapes, prior), float(self._over_sizes(logs)[0]) + prior))
         return evidence
 
     @property

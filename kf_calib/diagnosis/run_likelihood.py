@@ -223,22 +223,8 @@ class RunLikelihood:
         """Covariances (D, 3, 3) of scatter ("common"; "first" ... of one accelerometer) or of a setting error, of unit
         size where it equals the noise that was stated in its mean."""
         covariances = FREE[kind].shapes(self.means, self.linearised.state).sum(axis=0)
-        return _of_unit_size(self._root @ covariances @ np.swapaxes(self._root, 1, 2))
-
-    def shapes_along(self, effect: Effect) -> Floats | None:
-        """The same of an effect whose coefficients are others in each dwell; None where it changes no reading."""
-        linearised, dwells = self.linearised, self.linearised.dwells_at_state
-        added = candidate_columns(dwells, [effect], linearised.model.bench, linearised.state)
-        made = means_of(dwells, added).design
-        if not np.abs(made).max() > SEEN * linearised.model.bench.gravity_mps2:
-            return None
-        whitened = self._root @ made
-        return _of_unit_size(whitened @ np.swapaxes(whitened, 1, 2))
-
-
-def _of_unit_size(shapes: Floats) -> Floats:
-    """Return covariances (D, 3, 3) scaled to the noise that was stated."""
-    return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
+        shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
+        return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
 
 
 def _width(block: Combination) -> int:
