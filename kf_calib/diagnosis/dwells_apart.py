@@ -1,5 +1,7 @@
 """Dwells that are off, each by any amount and with readings that change in any way: a pose mistyped, a door slammed.
 
+One is off by a turn of one gimbal, or by any offsets of the three accelerometers; either is as likely.
+
 They are searched one after another, each next one by what the dwells without those before it tell: two that are off by
 as much hide each other. Each has the prior probability of one. In the noise that was stated alone, for in noise as
 large as they are off any dwell is as good as any other.
@@ -67,8 +69,21 @@ class DwellsApart:
         changes = self.courses.log_bayes(math.exp(self._log_prior))
         most = max(IN_CACHE // (8 * len(self.rows)), 1)  # sizes of noise at once
         means = [
-            log_bayes_of_any_size(*of_family.dwells(self.rows, without, slice(k, k + most)))
+            self._of_means(*of_family.dwells(self.rows, without, slice(k, k + most)))
             for of_family in self.noises
             for k in range(0, len(of_family), most)
         ]
         return np.concatenate(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)
+
+    def _of_means(self, gram: Floats, along: Floats) -> Floats:
+        """Return log Bayes factors (K, D) of changes of the mean of each dwell: gram (K, D, 3, 3), along (K, D, 3)."""
+        offsets = log_bayes_of_any_size(gram, along)
+        if not self.sizes.turns:
+            return offsets
+        turns = np.stack([*self.sizes.turns.values()])[..., None]  # (gimbals, D, 3, 1)
+        of_turns = [
+            log_bayes_of_any_size(turn.swapaxes(1, 2) @ gram @ turn, (along[:, :, None] @ turn)[:, :, 0])
+            for turn in turns
+        ]
+        of_one = np.logaddexp.reduce(of_turns) - math.log(len(turns))
+        return np.logaddexp(offsets, of_one) - math.log(2.0)

@@ -84,13 +84,13 @@ class HypothesisTable:
     """All rows, the likeliest first; their probabilities sum to one.
 
     certain: the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
-    scattering: the number of the accelerometer that alone scatters from dwell to dwell, if something does; 0 where
+    scattering: the accelerometer, or the gimbal, that alone scatters from dwell to dwell, if something does; "" where
     others do, too. same: effects that explain in this run just what the one of the likeliest row does.
     """
 
     rows: tuple[Hypothesis, ...]
     certain: Hypothesis | None = None
-    scattering: int = 0
+    scattering: str = ""
     same: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -5,20 +5,21 @@ scatter, setting errors, and both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.in_noises import InNoises
-from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated
+from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated, of_unit_size
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import OF_ONE, Parts
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
-_OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_OF_ONE = 0.1  # share of one accelerometer alone in scatter, and of one gimbal alone in setting errors
 INDEPENDENT = 0.5
 """Share of the values that are independent, where dwells differ by more than was stated, or by what no function has."""
 
@@ -31,7 +32,7 @@ _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of 
 class NoiseFamily:
     """Noise of which some parts are free.
 
-    parts: "setting", "common" (scatter) or those of one accelerometer alone. shapes: covariances (D, 3, 3) per unit of
+    parts: "setting" and "common" (scatter). shapes: covariances (D, 3, 3) per unit of
     the squared size, in units of the noise that was stated. log_prior: log of its prior probability.
     """
 
@@ -43,11 +44,14 @@ class NoiseFamily:
 class NoiseSizes:
     """All noises in which a run is weighed.
 
-    noise: what was stated. spare: degrees of freedom that the model leaves of the dwells' means.
+    noise: what was stated. spare: degrees of freedom that the model leaves of the dwells' means. turns: the change
+    (D, 3) of the means by a turn of each gimbal, by its name.
     """
 
-    def __init__(self, likelihood: RunLikelihood, noise: Noise, spare: int) -> None:
-        self._likelihood, self._noise, self._spare = likelihood, noise, spare
+    def __init__(
+        self, likelihood: RunLikelihood, noise: Noise, spare: int, turns: Mapping[str, Floats] = MappingProxyType({})
+    ) -> None:
+        self._likelihood, self._noise, self._spare, self.turns = likelihood, noise, spare, turns
         self._sizes = likelihood.sizes_of_noise()
 
     @cached_property
@@ -68,17 +72,21 @@ class NoiseSizes:
         return families
 
     @cached_property
-    def of_one(self) -> list[tuple[NoiseFamily, float]]:
-        """Scatter of one accelerometer alone, with its log evidence without any term. It stands against all effects:
-        beside one it would hide what else is missing, which often shows in one accelerometer."""
+    def of_one(self) -> list[tuple[str, NoiseFamily, float]]:
+        """Scatter of one accelerometer alone, and setting errors of one gimbal alone, by name, with their log evidence
+        without any term. They stand against all effects: beside one they would hide what else is missing, which often
+        shows in one accelerometer, or goes with one gimbal."""
         if len(self.families) < 2 or self._noise.attitude_unknown:
             return []
-        prior = self.families[1].log_prior + math.log(_OF_ONE / len(OF_ONE))
-        evidence = list[tuple[NoiseFamily, float]]()
-        for part in OF_ONE:
-            shapes = self._likelihood.shapes_of(part)
-            logs = self._likelihood.in_noises(shapes, self.squares).logs[None]
-            evidence.append((NoiseFamily((part,), shapes, prior), float(self._over_sizes(logs)[0]) + prior))
+        run, (common, setting) = self._likelihood, self.families[1:3]
+        alone = [(f"accelerometer {k}", common, run.shapes_of(part)) for k, part in enumerate(OF_ONE, start=1)]
+        alone += [(name, setting, of_unit_size(turn[:, :, None] * turn[:, None])) for name, turn in self.turns.items()]
+        evidence = list[tuple[str, NoiseFamily, float]]()
+        for name, of_all, shapes in alone:
+            alike = sum(other is of_all for _, other, _ in alone)
+            family = NoiseFamily(of_all.parts, shapes, of_all.log_prior + math.log(_OF_ONE / alike))
+            logs = run.in_noises(shapes, self.squares).logs[None]
+            evidence.append((name, family, float(self._over_sizes(logs)[0]) + family.log_prior))
         return evidence
 
     @property

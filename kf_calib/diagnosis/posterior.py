@@ -84,9 +84,17 @@ class RunPosterior:
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test, self._with_constants())
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
-        self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
+        spare = measured - model.count + len(model.fixed)
+        self._sizes = NoiseSizes(self._run.likelihood, self._noise, spare, self._turns())
         self._refused = set[str]()
         self._of_refits = dict[tuple[str, ...], tuple[RunLikelihood, Floats, Floats, Floats]]()
+
+    def _turns(self) -> dict[str, Floats]:
+        """Return the change (D, 3) of the dwells' means by a turn of each gimbal, where the run shows it."""
+        bench, run = self._before.model.bench, self._run
+        gimbals = range(1, len(bench.axes) + 1) if bench.angles else ()
+        turns = {f"gimbal {k}": run.likelihood.turned_by(run.formula_of(f":{k} = 1")) for k in gimbals}
+        return {name: turn for name, turn in turns.items() if turn is not None}
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
@@ -184,7 +192,7 @@ class RunPosterior:
         prior, of_noise, irregular = math.log(PRIOR["nothing"]), list[float](), list[float]()
         noises = [(family, float(log)) for family, log in zip(self._sizes.families, self._without, strict=True)]
         irregular.append(noises[0][1] + prior + math.log(_WITHIN))
-        for family, log in (*noises[1:], *self._sizes.of_one):
+        for family, log in (*noises[1:], *((family, log) for _, family, log in self._sizes.of_one)):
             share = self._share_of_unknown(family)
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
@@ -211,10 +219,11 @@ class RunPosterior:
         return 0.0 if family.parts == ("setting",) else _IRREGULAR
 
     @property
-    def _scattering(self) -> int:
-        """The number of the accelerometer that alone scatters, where that is the likeliest noise; else 0."""
-        logs = [log for _, log in self._sizes.of_one]
-        return int(np.argmax(logs)) + 1 if logs and max(logs) > self._without[1:].max() else 0
+    def _scattering(self) -> str:
+        """The accelerometer, or the gimbal, that alone scatters, where that is the likeliest noise; else ""."""
+        logs = {name: log for name, _, log in self._sizes.of_one}
+        name = max(logs, key=logs.__getitem__, default="")
+        return name if name and logs[name] > self._without[1:].max() else ""
 
     def _singles(self) -> list[Hypothesis]:
         """Return the rows of one term each."""

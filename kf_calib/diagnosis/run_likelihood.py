@@ -223,8 +223,21 @@ class RunLikelihood:
         """Covariances (D, 3, 3) of scatter ("common"; "first" ... of one accelerometer) or of a setting error, of unit
         size where it equals the noise that was stated in its mean."""
         covariances = FREE[kind].shapes(self.means, self.linearised.state).sum(axis=0)
-        shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
-        return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
+        return of_unit_size(self._root @ covariances @ np.swapaxes(self._root, 1, 2))
+
+    def turned_by(self, effect: Effect) -> Floats | None:
+        """The change (D, 3) of the means, whitened, by a unit coefficient of an effect; None where it changes none."""
+        linearised, dwells = self.linearised, self.linearised.dwells_at_state
+        added = candidate_columns(dwells, [effect], linearised.model.bench, linearised.state)
+        made = means_of(dwells, added).design
+        if not np.abs(made).max() > SEEN * linearised.model.bench.gravity_mps2:
+            return None
+        return (self._root @ made)[..., 0]
+
+
+def of_unit_size(shapes: Floats) -> Floats:
+    """Return covariances (D, 3, 3) scaled to the noise that was stated."""
+    return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
 
 
 def _width(block: Combination) -> int:

@@ -72,7 +72,8 @@ def _of_the_others(diagnosis: Diagnosis) -> str:
         if diagnosis.condition is not None:
             return (
                 f"The model agrees with the measurements if {diagnosis.condition}: this was estimated from their "
-                f"misfit (p {format_p(test.p_value)}), which no known effect explains beyond it.{blind}"
+                f"misfit (p {format_p(test.p_value)}), which no known effect explains beyond it."
+                f"{_of_one(diagnosis)}{blind}"
             )
         lines = test.lines.vibration_in_words if diagnosis.before.fit.dwells.folded.averaged else ""
         averaged = f" once their vibration at {lines} is averaged out" if lines else ""
@@ -266,9 +267,10 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
 
 
 def _of_one(diagnosis: Diagnosis) -> str:
-    """Return a sentence on the accelerometer that alone scatters; "" where others do, too."""
-    number = diagnosis.table.scattering if diagnosis.table else 0
-    return f" It is accelerometer {number} alone: look at its contacts and its supply." if number else ""
+    """Return a sentence on the accelerometer, or gimbal, that alone scatters; "" where others do, too."""
+    name = diagnosis.table.scattering if diagnosis.table else ""
+    parts = "its encoder and its brake" if name.startswith("gimbal") else "its contacts and its supply"
+    return f" It is {name} alone: look at {parts}." if name else ""
 
 
 def _others(diagnosis: Diagnosis, but: str = "") -> str:

@@ -266,6 +266,24 @@ def test_a_fault_of_no_catalogue_has_no_known_name(name: str) -> None:
                 "scale-warm-up", "platform-drift", "base-tilt", "cross-axis-square")), default=0.0) < 0.5  # fmt: skip
 
 
+@pytest.mark.parametrize(("gimbal", "dwells", "bench"), [
+    (3, 12, UNSTATED), *slow((3, 24, UNSTATED), (2, 12, UNSTATED), (2, 24, BENCH), (3, 12, BENCH), (3, 24, BENCH)),
+])  # fmt: skip
+def test_a_gimbal_that_alone_does_not_repeat_is_told_and_nothing_else_is(
+    gimbal: int, dwells: int, bench: Bench
+) -> None:
+    """In few dwells that was a function of its angle, with up to 99 %."""
+    sizes = 1e-5 * np.eye(3)[gimbal - 1] / 2.5
+    for seed in (61, 62):
+        errors = sizes * np.random.default_rng(seed).standard_normal((dwells, 3))
+        run = IndependentBench(seed, dwells, gimbals=lambda state, errors=errors: errors[state.dwell], bench=bench)
+        diagnosis = kf_calib.diagnose(run, replicate=False)
+        assert f"gimbal {gimbal} alone" in diagnosis.verdict and not diagnosis.missing, diagnosis.verdict
+        assert diagnosis.table is not None
+        drivers = sum(row.probability for row in diagnosis.table.rows if "gimbal" in row.driver)
+        assert drivers < 0.5, diagnosis.table
+
+
 def test_constants_of_two_effects_are_those_beside_each_other() -> None:
     """A bias and a scale factor of one sensor warm up: alone, each of the two time constants is another."""
 
