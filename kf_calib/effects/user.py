@@ -34,7 +34,7 @@ from types import ModuleType
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Bearer, Effect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
-from kf_calib.effects.frame import FrameEffect
+from kf_calib.effects.frame import RotationEffect
 from kf_calib.errors import InputError
 
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
@@ -69,7 +69,7 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
     classes = effect_classes(module)
     if not classes:
         raise InputError(
-            f"{path}: defines no effect: write a class that derives from SensorEffect, FrameEffect or Effect "
+            f"{path}: defines no effect: write a class that derives from SensorEffect, RotationEffect or Effect "
             "(from kf_calib.effects import SensorEffect)."
         )
     return classes
@@ -108,7 +108,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
         if not hasattr(kind, key):
             setattr(kind, key, value)
     said_by = next(each for each in kind.__mro__ if "borne_by" in vars(each))
-    if said_by in (SensorEffect, FrameEffect):  # the shape of its columns does not say what has it
+    if said_by in (SensorEffect, RotationEffect):  # the shape of its columns does not say what has it
         kind.borne_by = Bearer.EITHER
     checks.guard(kind)
     return kind
