@@ -62,18 +62,18 @@ def refuse(dwells: DwellTable, bench: Bench) -> None:
     means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
     _refuse_stuck(means, stated)
     affine, misfit = fit_affine(means, stated), float(Misfits.of_mounting(means, stated).of([CHANNELS])[0])
-    is_near = affine is None or affine.is_near()
+    is_near_nominal = affine is None or affine.is_near_nominal()
     if affine is not None and affine.left < NOISE and affine.is_along():
         _refuse_wrong_gain(means, affine, bench)
     if misfit > _CHANGE:  # else no change could explain more than it costs
         in_course = min(_one_dwell(means, stated), _exchange(means, stated))
-        least = min(misfit if is_near else math.inf, in_course[0])
+        least = min(misfit if is_near_nominal else math.inf, in_course[0])
         _refuse_mounting(means, stated, affine, least)
         if in_course[0] == least < math.inf:
             if in_course[1]:
                 raise BlunderError(in_course[1])
             return  # one dwell alone is off
-    if not is_near or (affine is None and determines_axes(means.readings / bench.gravity_mps2)):
+    if not is_near_nominal or (affine is None and determines_axes(means.readings / bench.gravity_mps2)):
         raise BlunderError(
             f"{_what_is_wrong(means, affine, bench)}, and no order or sign of channels, gimbals or angles brings all "
             "axes near nominal: check what the channels and the angles are, and state --nominal where the block is "
