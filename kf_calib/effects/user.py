@@ -36,6 +36,7 @@ from kf_calib.effects.effect import Bearer, Effect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
 from kf_calib.effects.frame import RotationEffect
 from kf_calib.errors import InputError
+from kf_calib.support.text import listing
 
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
 """Symbols of the paper's parameters, one or two of them never used: no effect may have them."""
@@ -96,7 +97,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     elif kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
         missing = ["coefficients", *missing]
     if missing:
-        raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
+        raise InputError(f"{who} lacks {listing(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
     given = getattr(kind, "name", None)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", kind.__name__).lower() if given is None else given
     if not (isinstance(name, str) and is_name(name)):

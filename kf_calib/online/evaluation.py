@@ -31,6 +31,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
+from kf_calib.support.text import listing
 
 _FIRST_LOOK_S = 1.0
 
@@ -140,7 +141,7 @@ class Evaluation(ABC, Generic[J, S]):
             settings = replace(self.settings, effects=(*self.settings.effects, *names))
             self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
             self.settings = settings
-            self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
+            self._publish(notice=f"{listing(names)} accepted", model=self.settings.effects)
             if self._last is not None and not self._waiting:
                 self._waiting.append(self._last)
             self._lock.notify_all()

@@ -26,6 +26,7 @@ from kf_calib.design.next_orientation import Outlook, SlewTimes, poses_within
 from kf_calib.errors import InputError
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.online.status import Judgement
+from kf_calib.support.text import listing
 
 Purpose = Literal["opening", "sharpen", "tell apart", "repeat", "return", "end"]
 Ended = Literal["", "targets", "named", "disagrees", "orientations", "budget"]
@@ -160,7 +161,7 @@ def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reache
     count = len(visited.stays)
     is_settled = judgement.alarm and judgement.snapshot.settled and judgement.diagnosis.sure
     if is_settled and itinerary.ends_when_named:
-        named = " and ".join(judgement.diagnosis.missing)
+        named = listing(judgement.diagnosis.missing)
         return Suggestion("end", f"the missing effect is named: {named}", ended="named")
     is_back = _same(visited.stays[0][0], visited.stays[-1][0])
     if is_reached and not judgement.alarm and count > itinerary.opening and is_back:
