@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.results import Fleet as open_fleet
     from kf_calib.noise.rest_noise import RestNoise, noise_at_rest
-    from kf_calib.online.sequential_test import Running, Watch
+    from kf_calib.online.sequential_test import RecursiveTest, SequentialTest
     from kf_calib.online.session import Session
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
@@ -80,7 +80,7 @@ _HOMES = {
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
-    "Running": ("online.sequential_test", "Running"),
+    "RecursiveTest": ("online.sequential_test", "RecursiveTest"),
     "Session": ("online.session", "Session"),
     "Recorder": ("sources.files.recorder", "Recorder"),
     "open_log": ("sources.text.lines", "Lines"),
@@ -88,17 +88,17 @@ _HOMES = {
     "open_table": ("sources.text.means", "open_table"),
     "save_view": ("views.rerun", "save_view"),
     "shown_in": ("support.units", "shown_in"),
-    "Watch": ("online.sequential_test", "Watch"),
+    "SequentialTest": ("online.sequential_test", "SequentialTest"),
 }
 
 shown_by(lambda: import_module("kf_calib.views.html"))
 
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
-    "KfCalibError", "Parameter", "Recorder", "Refits", "RestNoise", "Running", "SavedCalibration", "Session",
-    "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "noise_at_rest",
-    "open_calibration", "open_fleet", "open_log", "open_recording", "open_table", "plot", "save_calibration",
-    "save_view", "shown_in",
+    "KfCalibError", "Parameter", "Recorder", "RecursiveTest", "Refits", "RestNoise", "SavedCalibration",
+    "SequentialTest", "Session", "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "improve",
+    "noise_at_rest", "open_calibration", "open_fleet", "open_log", "open_recording", "open_table", "plot",
+    "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def replay(path: Path) -> int:
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.sources.files.recording import Recording
 
-    return calibrate(Recording(path)).tally.read
+    return calibrate(Recording(path)).counts.read
 
 
 def fold(path: Path) -> int:
@@ -67,7 +67,7 @@ def fold(path: Path) -> int:
 
     passed = Pass(Recording(path), Settings())
     passed.fold()
-    return passed.tally.read
+    return passed.counts.read
 
 
 def candidates(dwells: Any, bench: Any, columns: int = 70) -> list[Any]:
@@ -106,7 +106,7 @@ def fold_and_scan(path: Path) -> tuple[int, int]:
         if path not in _candidates:
             _candidates[path] = candidates(dwells, passed.source.bench)
         scanned(dwells, passed.source.bench, _candidates[path])
-    return passed.tally.read, sum(len(effect.coefficients) for effect in _candidates[path])
+    return passed.counts.read, sum(len(effect.coefficients) for effect in _candidates[path])
 
 
 _candidates: dict[Path, list[Any]] = {}

@@ -33,9 +33,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria, orientation_plan
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, Reach, Timing
-from kf_calib.design.next_orientation import Pace
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, GimbalLimits, Timing
+from kf_calib.design.next_orientation import SlewTimes
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
@@ -92,21 +92,21 @@ class Fixed:
     sigma: Floats
 
     @classmethod
-    def of(cls, bench: Bench, white_mps2: float, poses: Floats, pace: Pace, effect: str) -> Fixed:
+    def of(cls, bench: Bench, white_mps2: float, poses: Floats, slew_times: SlewTimes, effect: str) -> Fixed:
         """With the effect in the model that has to be estimated beside the twelve; empty for none."""
-        prospect = Prospect.of_bench(bench, white_mps2, SAMPLE_HZ * (DWELL_S - 1.25), DWELL_S)
+        information = PredictedInformation.of_bench(bench, white_mps2, SAMPLE_HZ * (DWELL_S - 1.25), DWELL_S)
         model = Model.of(bench, (effect,) if effect else ())
         nothing = np.zeros((model.count, model.count))
-        prospect = replace(prospect, model=model, state=model.nominal_state(), known=nothing)
+        information = replace(information, model=model, state=model.nominal_state(), known=nothing)
         order = np.resize(np.arange(len(poses)), MOST)
-        rows, factor, sigmas = prospect.rows(poses), prospect.start, list[Floats]()
+        rows, factor, sigmas = information.rows(poses), information.start, list[Floats]()
         for k in order:
             factor = triangle(np.vstack([factor, rows[k]]))
             blind = optimality_criteria.is_unseen(factor).any()
-            sigma = optimality_criteria.sigmas(factor) * prospect.units
+            sigma = optimality_criteria.sigmas(factor) * information.units
             sigmas.append(np.full(12, np.inf) if blind else sigma[:12])
         way = np.vstack([np.zeros(poses.shape[1]), poses[order]])
-        return cls(np.cumsum(pace.slews_s(way[:-1], way[1:]) + 1.0 + DWELL_S), np.array(sigmas))
+        return cls(np.cumsum(slew_times.slews_s(way[:-1], way[1:]) + 1.0 + DWELL_S), np.array(sigmas))
 
     def reaches_s(self, wanted: Floats) -> float:
         """When all targets are reached; infinite where they never are."""
@@ -114,11 +114,11 @@ class Fixed:
         return float(self.time_s[np.argmax(reached)]) if reached.any() else math.inf
 
 
-def planned_poses(bench: Bench, white_mps2: float, pace: Pace, count: int = 24) -> Floats:
+def planned_poses(bench: Bench, white_mps2: float, slew_times: SlewTimes, count: int = 24) -> Floats:
     """The poses of ``kf-calib plan --count 24``, in its order."""
-    prospect = Prospect.of_bench(bench, white_mps2, SAMPLE_HZ * (DWELL_S - 1.25), DWELL_S)
-    search = Search(prospect, Reach(bench), optimality_criteria.D, Scheme())
-    return orientation_plan.plan(search, count, Timing(DWELL_S, PEAK_OVER_MEAN * pace.rate_degps)).poses
+    information = PredictedInformation.of_bench(bench, white_mps2, SAMPLE_HZ * (DWELL_S - 1.25), DWELL_S)
+    search = Search(information, GimbalLimits(bench), optimality_criteria.D, Scheme())
+    return orientation_plan.plan(search, count, Timing(DWELL_S, PEAK_OVER_MEAN * slew_times.rate_degps)).poses
 
 
 def papers_poses(bench: Bench) -> Floats:
@@ -148,16 +148,16 @@ def one_bench(number: int) -> dict[str, Any]:
     """Drive a bench to its targets, adding what is missing; and the times of the fixed orders."""
     query, effect = query_of(number)
     run, began_s = simulation(options_from_query(query), {}), time.process_time()
-    bench, pace, white = run.bench, Pace(), run.noise.white_mps2
-    fixed = Fixed.of(bench, white, planned_poses(bench, white, pace), pace, effect)
-    paper = Fixed.of(bench, white, papers_poses(bench), pace, effect)
+    bench, slew_times, white = run.bench, SlewTimes(), run.noise.white_mps2
+    fixed = Fixed.of(bench, white, planned_poses(bench, white, slew_times), slew_times, effect)
+    paper = Fixed.of(bench, white, papers_poses(bench), slew_times, effect)
     targets = drawn_targets(number, fixed)
     wanted = np.array([targets[symbol] for symbol in paper_parameters.SYMBOLS])
     device, session = DrivenBench(run, None, [0.0] * 3), Session.fed(bench, Settings(), targets, auto=True)
     named = list[tuple[int, tuple[str, ...]]]()
     session.listeners.append(lambda judgement: _note(named, session, judgement.result))
-    itinerary = Itinerary(bench, pace, ends_when_named=False)
-    rules = Rules(itinerary.reach, pace)
+    itinerary = Itinerary(bench, slew_times, ends_when_named=False)
+    rules = Rules(itinerary.limits, slew_times)
     drive = Drive(SimulatedPositioner(device), session, itinerary, rules, SteppedTime(device, session))
     outcome = drive.run()
     final = session.finish()

@@ -34,7 +34,7 @@ from kf_calib import diagnose  # noqa: E402
 from kf_calib.estimation.calibration import evaluate  # noqa: E402
 from kf_calib.estimation.dwell_pass import Pass  # noqa: E402
 from kf_calib.estimation.settings import Settings  # noqa: E402
-from kf_calib.online.sequential_test import Watch  # noqa: E402
+from kf_calib.online.sequential_test import SequentialTest  # noqa: E402
 
 QUIET = "white", "setting error", "scatter", "setting error and scatter"
 FIRST = 5
@@ -71,23 +71,23 @@ def twist(state: State) -> np.ndarray:
 MISSING = {"second-order": Missing("second-order", 2e-5), "twist (no name)": Missing("", 4e-6)}
 
 
-def looks(source: IndependentBench) -> Iterator[Watch]:
+def looks(source: IndependentBench) -> Iterator[SequentialTest]:
     """The sequential test after each dwell of a stream."""
     dwells = Pass(source, Settings()).fold()
-    watch = Watch.over(dwells[:FIRST], source.bench)
-    yield watch
+    sequential = SequentialTest.over(dwells[:FIRST], source.bench)
+    yield sequential
     for dwell in dwells[FIRST:]:
-        watch = watch.after(dwell)
-        yield watch
+        sequential = sequential.after(dwell)
+        yield sequential
 
 
 def names_told(source: IndependentBench) -> set[tuple[str, ...]] | None:
     """The names that are told with 90 % or more at any look; None where there is no alarm."""
     told, alarmed = set[tuple[str, ...]](), False
-    for watch in looks(source):
-        if watch.alarmed is not None:
+    for sequential in looks(source):
+        if sequential.alarmed is not None:
             alarmed = True
-            first = diagnose(evaluate(watch.dwells, source.bench, Settings())).table
+            first = diagnose(evaluate(sequential.dwells, source.bench, Settings())).table
             if first is not None and first.first.effects and first.first.probability >= SURE:
                 told.add(first.first.effects)
     return told if alarmed else None

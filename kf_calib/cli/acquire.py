@@ -48,14 +48,14 @@ def _hidden_table() -> RenderableType:
     """Every kind of hidden effect, in two lines or more."""
     from rich.console import Group
 
-    from kf_calib.sources.simulation.injected import INNER, catalogue
+    from kf_calib.sources.simulation.injected import INNER_CONSTANTS, catalogue
     from kf_calib.views.terminal import LINED, table
 
     kinds = catalogue().values()
     rows = list[tuple[str, ...]]()
     for kind in kinds:
         names = kind.coefficients if len(kind.coefficients) < 7 else (*kind.coefficients[:2], "...")
-        constants = [f"{name}={value:.4g} {INNER[name].unit}" for name, value in kind.inner.items()]
+        constants = [f"{name}={value:.4g} {INNER_CONSTANTS[name].unit}" for name, value in kind.inner.items()]
         sizes = [" to ".join(dict.fromkeys(sizes)) for sizes in (kind.navigation, kind.mems)]
         rows.append(
             (f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
@@ -155,7 +155,7 @@ def _record(source: Source, path: Path, overwrite: bool, tick: Callable[[float],
         for _ in segmenter.finish():
             pass
     duration_s = 0.0 if first_ns is None else (last_ns - first_ns) / 1e9
-    notes = [f"recorded, and not used when it is evaluated: {text}" for text in segmenter.tally.sentences()]
+    notes = [f"recorded, and not used when it is evaluated: {text}" for text in segmenter.counts.sentences()]
     return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 

@@ -62,10 +62,10 @@ class LiveRun:
 
     def content(self, name: str) -> Content:
         """What is shown of the run now; name: of its source."""
-        from kf_calib.online.status import Standing
+        from kf_calib.online.status import RunStatus
         from kf_calib.views.live.content import content_of
 
-        standing = self.session.standing if self.session else Standing()
+        standing = self.session.standing if self.session else RunStatus()
         return content_of(standing, self.source.status, name, str(self._record or ""), self.doing())
 
     def start(self) -> None:

@@ -19,9 +19,9 @@ from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
-    from kf_calib.design.gimbal_limits import Reach
+    from kf_calib.design.gimbal_limits import GimbalLimits
     from kf_calib.design.optimality_criteria import Aim
-    from kf_calib.design.predicted_information import Prospect
+    from kf_calib.design.predicted_information import PredictedInformation
 
 _USUAL_DWELL_S = 30.0
 _AIM = "What to aim at"
@@ -103,11 +103,11 @@ def plan(
         _plan_by_hand(options, reading, evaluation, as_json)
         return
     outputs = claimed(overwrite=overwrite)
-    prospect = _prospect(options, reading, evaluation, as_json)
-    reach = _reach(prospect.model.bench, options)
-    scheme = Scheme.of(reach, options.repeats, options.antipodal)
-    search = Search(prospect, reach, _aim(options, prospect.model.bench.gravity_mps2), scheme)
-    timing = Timing(prospect.dwell_s, options.slew_degps, options.time_correlation)
+    information = _information(options, reading, evaluation, as_json)
+    limits = _reach(information.model.bench, options)
+    scheme = Scheme.of(limits, options.repeats, options.antipodal)
+    search = Search(information, limits, _aim(options, information.model.bench.gravity_mps2), scheme)
+    timing = Timing(information.dwell_s, options.slew_degps, options.time_correlation)
     with progress("planning", as_json):
         if options.fewest:
             made = orientation_plan.fewest(search, timing, options.seed)
@@ -166,9 +166,11 @@ def _plan_by_hand(options: PlanOptions, reading: ReadingOptions, evaluation: Eva
     print_result(as_json, views.hand_plan_object, views.hand_plan_report, made)
 
 
-def _prospect(options: PlanOptions, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool) -> Prospect:
+def _information(
+    options: PlanOptions, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool
+) -> PredictedInformation:
     from kf_calib.bench.bench import Bench
-    from kf_calib.design.predicted_information import Prospect
+    from kf_calib.design.predicted_information import PredictedInformation
 
     if options.recording is not None:
         return _after(options.recording, options, reading, evaluation, quiet)
@@ -176,17 +178,17 @@ def _prospect(options: PlanOptions, reading: ReadingOptions, evaluation: Evaluat
     if "latitude_deg" not in keys:
         keys.setdefault("gravity_mps2", 9.81)
     dwell_s = options.dwell_s or _USUAL_DWELL_S
-    made = Prospect.of_bench(Bench.from_metadata(keys), options.white_mps2, 1.0, dwell_s)
+    made = PredictedInformation.of_bench(Bench.from_metadata(keys), options.white_mps2, 1.0, dwell_s)
     return replace(made, readings=options.readings or max(made.still_s * options.sample_hz, 1.0))
 
 
 def _after(
     recording: Path, options: PlanOptions, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool
-) -> Prospect:
+) -> PredictedInformation:
     import numpy as np
 
     from kf_calib.bench.streams import Table
-    from kf_calib.design.predicted_information import Prospect
+    from kf_calib.design.predicted_information import PredictedInformation
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.measurement_model import Model
 
@@ -194,7 +196,7 @@ def _after(
     gimbals = source.bench if source.bench.axes else _with_gimbals(recording, source.bench, reading)
     with progress(f"reading {recording.name}", quiet) as tick:
         result = calibrate(source, settings, tick)
-    made = Prospect.after(result.fit, settings.prior)
+    made = PredictedInformation.after(result.fit, settings.prior)
     if gimbals is not source.bench and made.last is not None:  # where these gimbals stand is not known: at zero
         last = replace(made.last, pose=np.zeros(len(gimbals.axes)))
         made = replace(made, model=Model(gimbals, made.model.effects), last=last)
@@ -217,18 +219,18 @@ def _with_gimbals(recording: Path, bench: Bench, reading: ReadingOptions) -> Ben
     return replace(bench, axes=parse_axes(stated))
 
 
-def _reach(bench: Bench, options: PlanOptions) -> Reach:
+def _reach(bench: Bench, options: PlanOptions) -> GimbalLimits:
     from kf_calib.bench.bench import axis_names
     from kf_calib.bench.keys import ranges
-    from kf_calib.design.gimbal_limits import Reach
+    from kf_calib.design.gimbal_limits import GimbalLimits
     from kf_calib.sources.simulation.visit_plans import angles_from_csv
 
-    stated, names = Reach.of(bench), axis_names(bench.axes)
+    stated, names = GimbalLimits.of(bench), axis_names(bench.axes)
     limits = {**stated.limits_deg, **{j: ends for text in options.limits for j, ends in ranges(text, names).items()}}
     zones = [*stated.zones_deg, *(ranges(text, names) for text in options.zones)]
     path = options.positions
     positions = angles_from_csv(path, len(bench.axes)) if path else None
-    return Reach(bench, limits, zones, options.grid_deg, positions)
+    return GimbalLimits(bench, limits, zones, options.grid_deg, positions)
 
 
 def _aim(options: PlanOptions, gravity_mps2: float) -> Aim:

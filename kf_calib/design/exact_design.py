@@ -23,9 +23,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Mask, first_least
 from kf_calib.design import optimality_criteria
-from kf_calib.design.gimbal_limits import Reach, wrap
+from kf_calib.design.gimbal_limits import GimbalLimits, wrap
 from kf_calib.design.optimality_criteria import Aim, Score
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 
@@ -74,18 +74,18 @@ class Scheme:
         return wrap(other)
 
     @classmethod
-    def of(cls, reach: Reach, repeats: int, antipodal: bool) -> Scheme:
+    def of(cls, limits: GimbalLimits, repeats: int, antipodal: bool) -> Scheme:
         """The scheme for a bench; raises InputError if antipodes are wanted and no gimbal reverses gravity."""
         if not antipodal:
             return cls(repeats)
-        bench, width = reach.bench, len(reach.bench.axes)
+        bench, width = limits.bench, len(limits.bench.axes)
         poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, width))
         schemes = list[tuple[int, Scheme]]()
         for j, signs in itertools.product(range(width), itertools.product((1.0, -1.0), repeat=width)):
             scheme = cls(repeats, j, signs)
             forces = (bench.specific_force(np.zeros(32), each) for each in (poses, scheme.antipodes(poses)))
             if np.abs(sum(forces)).max() < 1e-9 * bench.gravity_mps2:
-                schemes.append((int(reach.allowed(scheme.antipodes(reach.candidates)).sum()), scheme))
+                schemes.append((int(limits.allowed(scheme.antipodes(limits.candidates)).sum()), scheme))
         if not schemes:
             raise InputError(
                 "no gimbal of these axes turns gravity over by half a turn, so there are no antipodal pairs: leave out "
@@ -96,10 +96,10 @@ class Scheme:
 
 @dataclass(frozen=True)
 class Search:
-    """A search for the orientations within ``reach`` that minimise ``aim``."""
+    """A search for the orientations within ``limits`` that minimise ``aim``."""
 
-    prospect: Prospect
-    reach: Reach
+    information: PredictedInformation
+    limits: GimbalLimits
     aim: Aim
     scheme: Scheme = Scheme()
     at_s: Floats | None = None
@@ -108,9 +108,9 @@ class Search:
     @cached_property
     def candidates(self) -> Floats:
         """Orientations (n, k) to choose from; of several with the same information, the one that is rotated least."""
-        poses = self.reach.candidates
+        poses = self.limits.candidates
         if self.scheme.turned is not None:
-            poses = poses[self.reach.allowed(self.scheme.antipodes(poses))]
+            poses = poses[self.limits.allowed(self.scheme.antipodes(poses))]
             if not len(poses):
                 raise InputError("no orientation has its antipode within the limits: leave out --antipodal.")
         rows = self.rows(poses).reshape(len(poses), -1)
@@ -124,20 +124,20 @@ class Search:
 
     def rows(self, poses: Floats) -> Floats:
         """Whitened rows (n, r, p) of all visits for each orientation (n, k)."""
-        rows = self.prospect.rows(self.scheme.visits(poses), self.at_s)
+        rows = self.information.rows(self.scheme.visits(poses), self.at_s)
         return rows.reshape(len(poses), -1, rows.shape[2])
 
     def factor(self, rows: Floats) -> Floats:
         """Information factor (p, p) of the prior information and rows (n, r, p)."""
-        return triangle(np.vstack([self.prospect.start, rows.reshape(-1, rows.shape[-1])]))
+        return triangle(np.vstack([self.information.start, rows.reshape(-1, rows.shape[-1])]))
 
     def refuse_unseen(self) -> None:
         """Raise UnobservableError if all candidates together leave parameters undetermined."""
-        if not optimality_criteria.is_unseen(self.prospect.start).any():
+        if not optimality_criteria.is_unseen(self.information.start).any():
             return
         lost = optimality_criteria.is_unseen(self.factor(self.candidate_rows))
         if lost.any():
-            names = ", ".join(symbol for symbol, own in zip(self.prospect.symbols, lost, strict=True) if own)
+            names = ", ".join(symbol for symbol, own in zip(self.information.symbols, lost, strict=True) if own)
             raise UnobservableError(
                 f"no set of the orientations that can be reached determines {names}: widen the limits (--limit, "
                 "--forbid, --positions), or add a gimbal axis."
@@ -147,7 +147,7 @@ class Search:
         """The best ``count`` orientations found, (count, k)."""
         chosen = self.exchange(count)
         poses = self.candidates[chosen]
-        if not self.reach.continuous:
+        if not self.limits.continuous:
             return poses
         starts = [poses]
         if count <= _FEW:
@@ -177,12 +177,12 @@ class Search:
         dwells are worth.
         """
         rows, greedy = self.candidate_rows, list[int]()
-        known = triangle(np.vstack([self.prospect.start, np.diag(_FAINT * np.linalg.norm(rows, axis=(0, 1)))]))
+        known = triangle(np.vstack([self.information.start, np.diag(_FAINT * np.linalg.norm(rows, axis=(0, 1)))]))
         for _ in range(count):
             greedy.append(self._choice(optimality_criteria.D, known)[0])
             known = triangle(np.vstack([known, rows[greedy[-1]]]))
         rng = np.random.default_rng(0)
-        others = [] if self.reach.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
+        others = [] if self.limits.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
         found = [self._exchange_from(start) for start in (greedy, *others)]
         return found[first_least(np.array([float(self._score(self.factor(rows[each]))) for each in found]))]
 
@@ -240,11 +240,11 @@ class Search:
 
     def _rooms(self, poses: Floats) -> Floats:
         """Return the bounds (n, k, 2) of each orientation within which it and its antipode are allowed."""
-        rooms = self.reach.rooms(poses)
+        rooms = self.limits.rooms(poses)
         if self.scheme.turned is None:
             return rooms
         other = self.scheme.antipodes(poses)
-        theirs = self.reach.rooms(other) - other[:, :, None]
+        theirs = self.limits.rooms(other) - other[:, :, None]
         mirrored = np.array(self.scheme.signs) < 0
         theirs[:, mirrored] = -theirs[:, mirrored, ::-1]
         theirs += poses[:, :, None]
@@ -275,12 +275,12 @@ class Search:
 
         there = at(poses)
         largest = float(there.max())
-        if self.reach.continuous:
+        if self.limits.continuous:
             for k in np.argsort(there)[-3:]:
                 room = self._rooms(poses[k : k + 1])[0]
                 found = minimize(lambda q: -float(at(q[None])[0]), poses[k], method="L-BFGS-B", bounds=room)
                 largest = max(largest, -float(found.fun))
-        return float(np.square(self.prospect.start @ inverse).sum()), largest
+        return float(np.square(self.information.start @ inverse).sum()), largest
 
     def d_bound(self, rows: Floats) -> float:
         """An upper bound of log det M*^(1/p) over all designs of as many orientations as ``rows`` (n, r, p) has.
@@ -288,7 +288,7 @@ class Search:
         It is the least of three bounds: from the design itself, which is tight at the optimum, from the best weights of
         the candidates, and from balanced directions.
         """
-        bounds, balanced = list[float](), self.prospect.balanced(len(rows) * self.scheme.copies)
+        bounds, balanced = list[float](), self.information.balanced(len(rows) * self.scheme.copies)
         for design in (rows, self._weighted_rows(len(rows)), *([] if balanced is None else [balanced])):
             known, largest = self.variance_function(design, self.candidates)
             width = design.shape[2]
@@ -313,11 +313,11 @@ class Search:
     def next(self) -> Floats:
         """The next orientation (k,) after which the cost is least, found by random search that narrows about the
         best."""
-        if not self.reach.continuous:
+        if not self.limits.continuous:
             return self._first_of(self.candidates)
-        rng, (low, high) = np.random.default_rng(0), self.reach.bounds.T
+        rng, (low, high) = np.random.default_rng(0), self.limits.bounds.T
         scattered = rng.uniform(low, high, (_SCATTERED, len(low)))
-        best = self._first_of(np.vstack([scattered[self._is_allowed(scattered)], self.reach.candidates[:1]]))
+        best = self._first_of(np.vstack([scattered[self._is_allowed(scattered)], self.limits.candidates[:1]]))
         for reach_deg in (24.0, 8.0, 2.5, 0.8):
             about = best + np.radians(rng.uniform(-reach_deg, reach_deg, (_ABOUT, len(best))))
             best = self._first_of(np.vstack([best, about[self._is_allowed(about)]]))
@@ -325,15 +325,15 @@ class Search:
 
     def _is_allowed(self, poses: Floats) -> Mask:
         """Return a mask of the poses that are allowed together with their antipodes."""
-        inside = self.reach.allowed(wrap(poses))
-        return inside if self.scheme.turned is None else inside & self.reach.allowed(self.scheme.antipodes(poses))
+        inside = self.limits.allowed(wrap(poses))
+        return inside if self.scheme.turned is None else inside & self.limits.allowed(self.scheme.antipodes(poses))
 
     def _first_of(self, poses: Floats) -> Floats:
         """Return the pose after which the cost is least."""
-        rows, start = self.rows(poses), self.prospect.start
+        rows, start = self.rows(poses), self.information.start
         so_far = np.broadcast_to(start, (len(rows), *start.shape))
         return poses[first_least(self._score(triangle(np.concatenate([so_far, rows], axis=1))))]
 
     def without_limits(self) -> Search:
         """The same search over all orientations that the axes can reach."""
-        return replace(self, reach=Reach(self.reach.bench), scheme=Scheme())
+        return replace(self, limits=GimbalLimits(self.limits.bench), scheme=Scheme())

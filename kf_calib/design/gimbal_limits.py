@@ -34,7 +34,7 @@ _POSES = 4096
 
 
 @dataclass(frozen=True)
-class Reach:
+class GimbalLimits:
     """The limits of a bench.
 
     - limits_deg: range of each limited gimbal, by its number from 0.
@@ -50,7 +50,7 @@ class Reach:
     positions_deg: Sequence[Sequence[float]] | None = None
 
     @classmethod
-    def of(cls, bench: Bench) -> Reach:
+    def of(cls, bench: Bench) -> GimbalLimits:
         """The limits that the description of the bench states."""
         names = axis_names(bench.axes)
         return cls(bench, limits_of(bench.limits_deg, names), zones_of(bench.forbidden_deg, names))
@@ -165,12 +165,12 @@ MARGIN_DEG = 1.0
 _TURNS = (-2.0 * np.pi, 0.0, 2.0 * np.pi)
 
 
-def is_free(reach: Reach, start: Floats, end: Floats) -> Mask:
+def is_free(limits: GimbalLimits, start: Floats, end: Floats) -> Mask:
     """Mask (m,) of the ends (m, k), rad, to which all gimbals may go at once from ``start`` (k,) or (m, k), rad."""
     margin = np.radians(MARGIN_DEG)
     low, high = np.minimum(start, end) - margin, np.maximum(start, end) + margin
     free = np.ones(len(end), bool)
-    for zone in reach.zones_deg:
+    for zone in limits.zones_deg:
         inside = np.ones(len(end), bool)
         for j, ends_deg in zone.items():
             begin, stop = np.radians(ends_deg)
@@ -180,32 +180,32 @@ def is_free(reach: Reach, start: Floats, end: Floats) -> Mask:
     return free
 
 
-def route(reach: Reach, start: Floats, end: Floats) -> list[Floats] | None:
+def route(limits: GimbalLimits, start: Floats, end: Floats) -> list[Floats] | None:
     """The orientations (k,), rad, to go to one after the other, the last of them ``end``; None where no way is free.
 
     start, end (k,): rad. It is the end alone where all gimbals may go at once.
     """
-    if not reach.allowed(end[None])[0]:
+    if not limits.allowed(end[None])[0]:
         return None
-    if is_free(reach, start, end[None])[0]:
+    if is_free(limits, start, end[None])[0]:
         return [end]
     for order in itertools.permutations(range(len(start))):
         stations = _stations(start, end[None], order)
-        if all(is_free(reach, before, after)[0] for before, after in itertools.pairwise(stations)):
+        if all(is_free(limits, before, after)[0] for before, after in itertools.pairwise(stations)):
             distinct = [station[0] for k, station in enumerate(stations[1:]) if (station != stations[k]).any()]
             return distinct or [end]
     return None
 
 
-def can_be_reached(reach: Reach, start: Floats, ends: Floats) -> Mask:
+def can_be_reached(limits: GimbalLimits, start: Floats, ends: Floats) -> Mask:
     """Mask (m,) of the ends (m, k), rad, to which ``route`` finds a way from ``start`` (k,), rad."""
-    reached = is_free(reach, start, ends)
+    reached = is_free(limits, start, ends)
     if not reached.all():
         for order in itertools.permutations(range(len(start))):
             stations = _stations(start, ends, order)
-            legs = [is_free(reach, before, after) for before, after in itertools.pairwise(stations)]
+            legs = [is_free(limits, before, after) for before, after in itertools.pairwise(stations)]
             reached |= np.all(legs, axis=0)
-    return reached & reach.allowed(ends)
+    return reached & limits.allowed(ends)
 
 
 def _stations(start: Floats, ends: Floats, order: tuple[int, ...]) -> list[Floats]:
@@ -270,7 +270,9 @@ def _correlations(times: Floats, space: Floats) -> Floats:
     return np.linalg.norm(centred @ space, axis=1) / np.where(spread > 0, spread, 1.0)
 
 
-def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: Floats | None, seed: int = 0) -> Ints:
+def order(
+    poses: Floats, columns: Floats, timing: Timing, limits: GimbalLimits, start: Floats | None, seed: int = 0
+) -> Ints:
     """The order (n,) of visits to poses (n, k) with the least time in slews among those that keep the correlation
     small.
 
@@ -282,10 +284,10 @@ def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: F
         return np.arange(count)
     rng, space = np.random.default_rng(seed), _space(columns)
     ways = slews_s(poses[:, None], poses[None], timing.slew_degps)
-    costs = ways + _CROSSING_S * reach.crosses(poses[:, None], poses[None]) + np.where(ways > 0, 0.0, _AGAIN_S)
+    costs = ways + _CROSSING_S * limits.crosses(poses[:, None], poses[None]) + np.where(ways > 0, 0.0, _AGAIN_S)
     first = np.zeros(count)
     if start is not None:
-        first = slews_s(poses, start, timing.slew_degps) + _CROSSING_S * reach.crosses(start[None], poses)
+        first = slews_s(poses, start, timing.slew_degps) + _CROSSING_S * limits.crosses(start[None], poses)
     bound = 0 < space.shape[1] < count - 1
     scale = float(count * max(ways.mean(), 1e-3))
 

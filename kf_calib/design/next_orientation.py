@@ -19,8 +19,8 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask, first_least
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.gimbal_limits import GimbalLimits, can_be_reached, wrap
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import counts_of, slices
@@ -131,7 +131,7 @@ def _below(factor: Floats, rows: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Course:
+class SigmaForecast:
     """The predicted decrease of the twelve sigmas over a sequence of orientations, each of which reduces them most.
 
     - gimbal_deg: the first orientation.
@@ -151,8 +151,8 @@ class Course:
         return paper_parameters.SYMBOLS[worst], float(self.sigma[1, worst] / self.sigma[0, worst])
 
     def seconds_to(self, wanted: Floats, sigma: Floats) -> Floats:
-        """Seconds (12,) until each sigma is as small as ``wanted`` (12,); beyond the course, sigmas fall with the root
-        of the dwells.
+        """Seconds (12,) until each sigma is as small as ``wanted`` (12,); beyond the forecast, sigmas fall with the
+        root of the dwells.
 
         ``sigma`` (12,) are the present sigmas; NaN counts as larger than any target.
         """
@@ -163,7 +163,7 @@ class Course:
         return np.where(sigma <= wanted, 0.0, np.maximum(needed, 1.0) * self.each_s)
 
 
-def course(fitted: Fit, sizes: Floats) -> Course | None:
+def forecast(fitted: Fit, sizes: Floats) -> SigmaForecast | None:
     """The sequence of orientations that reduce the twelve sigmas most, each chosen after those before it; None without
     gimbals.
 
@@ -173,7 +173,7 @@ def course(fitted: Fit, sizes: Floats) -> Course | None:
     poses = _poses(fitted)
     if poses is None:
         return None
-    factor, rows = factor_of(fitted), Prospect.following(fitted).columns([], poses)
+    factor, rows = factor_of(fitted), PredictedInformation.following(fitted).columns([], poses)
     jacobian = paper_parameters.jacobian(fitted.linearised.state[:STATE_COUNT])
     at_least = np.diag(1.0 / np.maximum(fitted.linearised.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
@@ -184,7 +184,7 @@ def course(fitted: Fit, sizes: Floats) -> Course | None:
         root = root_after(root, rows[best : best + 1])[0]
         sigmas.append(sigmas_of(root, jacobian))
     angles = tuple(np.degrees(poses[first]).round(1).tolist())
-    return Course(angles, np.array(sigmas), len(fitted.dwells), _each_s(fitted))
+    return SigmaForecast(angles, np.array(sigmas), len(fitted.dwells), _each_s(fitted))
 
 
 def _each_s(fitted: Fit) -> float:
@@ -236,19 +236,19 @@ def _poses(fitted: Fit) -> Floats | None:
     bench = fitted.linearised.model.bench
     if not bench.axes:
         return None
-    poses = poses_within(Reach.of(bench))
+    poses = poses_within(GimbalLimits.of(bench))
     poses = poses[is_elsewhere(poses, fitted.dwells[-1].pose)]
     return poses if len(poses) else None
 
 
-def poses_within(reach: Reach) -> Floats:
+def poses_within(limits: GimbalLimits) -> Floats:
     """Gimbal angles (m, k), rad, that a bench can take: multiples of 45 deg, and random multiples of 5 deg."""
-    count, (low, high) = len(reach.bench.axes), np.degrees(reach.bounds).T
+    count, (low, high) = len(limits.bench.axes), np.degrees(limits.bounds).T
     rng = np.random.default_rng(0)
     coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
     fine = np.round(rng.uniform(low, high, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
     poses = np.radians(np.concatenate([coarse, fine]))
-    return poses if reach.free else poses[reach.allowed(poses)]
+    return poses if limits.free else poses[limits.allowed(poses)]
 
 
 def is_elsewhere(poses: Floats, pose: Floats) -> Mask:
@@ -265,8 +265,8 @@ def _with_next(
     added = candidate_columns(linearised.dwells_at_state, effects, linearised.model.bench, linearised.state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
     so_far = whiten(linearised.dwells_at_state, columns, noise, linearised.state)
-    prospect = replace(Prospect.following(fitted), noise=noise)
-    rows = np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])
+    information = replace(PredictedInformation.following(fitted), noise=noise)
+    rows = np.array([information.columns(effects, poses, float(wait_s)) for wait_s in waits_s])
     return accumulate(so_far, steps(linearised.dwells, noise))[:-1, :-1], rows
 
 
@@ -280,7 +280,7 @@ STAYS_S = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)
 
 
 @dataclass(frozen=True)
-class Pace:
+class SlewTimes:
     """How fast a bench is.
 
     rate_degps, acceleration_degps2: of its gimbals. overhead_s: what a stay takes beside the readings that count, s:
@@ -315,19 +315,19 @@ class Outlook:
     """What further stays will bring.
 
     fitted: the run so far. wanted (12,): targets of the sigmas, infinite where there is none. pending: poses (k,) and
-    seconds of readings that are not in ``fitted``; the last of them is where the platform stands. reach, pace: of the
-    bench.
+    seconds of readings that are not in ``fitted``; the last of them is where the platform stands. limits, slew_times:
+    of the bench.
     """
 
     fitted: Fit
     wanted: Floats
     pending: Sequence[tuple[Floats, float]]
-    reach: Reach
-    pace: Pace
+    limits: GimbalLimits
+    slew_times: SlewTimes
 
     @cached_property
-    def _prospect(self) -> Prospect:
-        return replace(Prospect.following(self.fitted), noise=self.fitted.noise)
+    def _information(self) -> PredictedInformation:
+        return replace(PredictedInformation.following(self.fitted), noise=self.fitted.noise)
 
     @cached_property
     def rate_hz(self) -> float:
@@ -338,7 +338,7 @@ class Outlook:
     def _rows(self, poses: Floats, seconds: float) -> Floats:
         """Return the whitened rows (m, 3, p) of a stay at each pose (m, k)."""
         readings = max(self.rate_hz * seconds, 1.0)
-        return replace(self._prospect, readings=readings).columns([], poses)
+        return replace(self._information, readings=readings).columns([], poses)
 
     @cached_property
     def _root(self) -> Floats:
@@ -365,12 +365,12 @@ class Outlook:
     def best(self, stays_s: Sequence[float] = STAYS_S) -> Stay | None:
         """The stay with the largest gain per second; None where no other orientation can be reached."""
         here = self.pending[-1][0]
-        poses = poses_within(self.reach)
+        poses = poses_within(self.limits)
         poses = poses[is_elsewhere(poses, here)]
-        poses = poses[can_be_reached(self.reach, here, poses)]
+        poses = poses[can_be_reached(self.limits, here, poses)]
         if not len(poses):
             return None
-        going_s, before = self.pace.slews_s(here, poses) + self.pace.overhead_s, self.missing(self.sigma)
+        going_s, before = self.slew_times.slews_s(here, poses) + self.slew_times.overhead_s, self.missing(self.sigma)
         stays = list[tuple[float, Stay]]()
         for stay_s in stays_s:
             sigma = sigmas_after(self._root, self._rows(poses, stay_s), self._jacobian)
@@ -386,7 +386,7 @@ class Outlook:
         taken to grow with the variance.
         """
         way = np.vstack([self.pending[-1][0], poses])
-        going_s = float(self.pace.slews_s(way[:-1], way[1:]).sum()) + len(poses) * self.pace.overhead_s
+        going_s = float(self.slew_times.slews_s(way[:-1], way[1:]).sum()) + len(poses) * self.slew_times.overhead_s
         expected_s = list[float]()
         for stay_s in STAYS_S:
             rows = self._rows(poses, stay_s).reshape(-1, len(self._root))

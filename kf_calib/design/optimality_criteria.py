@@ -2,7 +2,7 @@
 
 An ``Aim`` is a function of the factor R (p, p), where R^T R is the information about the states. Anything that can be
 computed from R may be an aim, such as the sigmas of the twelve parameters or the separation of two effects. The factors
-are those of a ``Prospect``, of parameters in its units (rad, 1, g; effects: their scale).
+are those of a ``PredictedInformation``, of parameters in its units (rad, 1, g; effects: their scale).
 
   D          log of the geometric mean of the principal sigmas: the generalised variance
   A          log of the rms of all sigmas

@@ -1,7 +1,7 @@
 """Plans of a calibration: which orientations, in which order, and how well the parameters will be known.
 
-  prospect = Prospect.of_bench(bench, sigma_mps2=1e-4, readings=100, dwell_s=30.0)   # or Prospect.after(run.fit)
-  search = Search(prospect, Reach(bench, {1: (-90.0, 90.0)}), optimality_criteria.D)
+  information = PredictedInformation.of_bench(bench, sigma_mps2=1e-4, readings=100, dwell_s=30.0)  # or after(run.fit)
+  search = Search(information, GimbalLimits(bench, {1: (-90.0, 90.0)}), optimality_criteria.D)
   made = plan(search, 12, Timing(dwell_s=30.0, slew_degps=20.0))
   made.gimbal_deg, made.sigma[-1], made.d_efficiency
 
@@ -24,7 +24,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
 from kf_calib.design.gimbal_limits import Timing, middles_s, order, slews_s, time_correlation
-from kf_calib.design.predicted_information import PAUSE_S, Prospect
+from kf_calib.design.predicted_information import PAUSE_S, PredictedInformation
 from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.noise.reml import directions
@@ -44,9 +44,9 @@ class Plan:
     timing: Timing
 
     @property
-    def prospect(self) -> Prospect:
+    def information(self) -> PredictedInformation:
         """The predicted information of the search."""
-        return self.search.prospect
+        return self.search.information
 
     @property
     def gimbal_deg(self) -> Floats:
@@ -56,35 +56,35 @@ class Plan:
     @cached_property
     def at_s(self) -> Floats:
         """Middles of the dwells (n,), s, on the clock of the run so far."""
-        last = self.prospect.last
+        last = self.information.last
         return middles_s(self.poses, self.timing) + (last.end_s + PAUSE_S if last else 0.0)
 
     @cached_property
     def factors(self) -> Floats:
         """Information factors (n + 1, p, p) before the first dwell and after each."""
-        factors = [self.prospect.start]
-        for rows in self.prospect.rows(self.poses, self.at_s):
+        factors = [self.information.start]
+        for rows in self.information.rows(self.poses, self.at_s):
             factors.append(triangle(np.vstack([factors[-1], rows])))
         return np.array(factors)
 
     @cached_property
     def sigma(self) -> Floats:
         """Sigmas (n + 1, p) of the parameters in SI before the first dwell and after each; NaN if not determined."""
-        out = optimality_criteria.sigmas(self.factors) * self.prospect.units
+        out = optimality_criteria.sigmas(self.factors) * self.information.units
         return np.where([optimality_criteria.is_unseen(factor) for factor in self.factors], np.nan, out)
 
     @property
     def targets(self) -> Floats:
         """Sigmas (p,) in SI that the plan aims at; infinite where none is asked for."""
-        targets, asked = np.full(len(self.prospect.units), np.inf), self.search.aim.tolerated
+        targets, asked = np.full(len(self.information.units), np.inf), self.search.aim.tolerated
         if asked is not None:
-            targets[:STATE_COUNT] = asked * self.prospect.units[:STATE_COUNT]
+            targets[:STATE_COUNT] = asked * self.information.units[:STATE_COUNT]
         return targets
 
     @cached_property
     def directions(self) -> Floats:
         """Unit vectors (n, 3) of the specific force in the platform frame."""
-        force = self.prospect.stimulus(self.poses, self.at_s).force_mps2
+        force = self.information.stimulus(self.poses, self.at_s).force_mps2
         return force / np.linalg.norm(force, axis=1, keepdims=True)
 
     @cached_property
@@ -93,10 +93,10 @@ class Plan:
 
         For a plan that continues a run it is that of the factor, which includes the run's dwells.
         """
-        if self.prospect.last is not None:
+        if self.information.last is not None:
             return float(np.linalg.cond(self.factors[-1][:STATE_COUNT, :STATE_COUNT]))
-        stimulus = self.prospect.stimulus(self.poses, self.at_s)
-        design = self.prospect.model.columns(stimulus, self.prospect.state) @ self.prospect.transform
+        stimulus = self.information.stimulus(self.poses, self.at_s)
+        design = self.information.model.columns(stimulus, self.information.state) @ self.information.transform
         return float(np.linalg.cond(design[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)))
 
     @cached_property
@@ -107,21 +107,21 @@ class Plan:
     @cached_property
     def generalised_sigma(self) -> float:
         """Geometric mean of the principal sigmas of the twelve (rad, 1, g) from this plan alone."""
-        rows = self.prospect.rows(self.poses, self.at_s)[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)
+        rows = self.information.rows(self.poses, self.at_s)[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)
         return math.exp(float(optimality_criteria.D(triangle(rows))))
 
     @cached_property
     def papers_generalised_sigma(self) -> float:
         """The same for the paper's optimal set with as many readings in each of its orientations."""
-        covariances = papers_covariances(self.prospect)
-        units = self.prospect.units[:STATE_COUNT].reshape(3, 4)
+        covariances = papers_covariances(self.information)
+        units = self.information.units[:STATE_COUNT].reshape(3, 4)
         scaled = covariances / (units[:, :, None] * units[:, None, :])
         return math.exp(float(np.linalg.slogdet(scaled)[1].sum()) / (2 * STATE_COUNT))
 
     @cached_property
     def _rows(self) -> Floats:
         """Return the whitened rows of the plan's dwells."""
-        return self.prospect.rows(self.poses)
+        return self.information.rows(self.poses)
 
     @cached_property
     def _everywhere(self) -> Search:
@@ -157,9 +157,11 @@ class Plan:
 
         In white noise these are sigma sqrt(3/N)/g for angles and scale factors and sigma/sqrt(N) for biases.
         """
-        balanced = self.prospect.balanced(len(self.poses))
+        balanced = self.information.balanced(len(self.poses))
         return (
-            None if balanced is None else optimality_criteria.sigmas(self.search.factor(balanced)) * self.prospect.units
+            None
+            if balanced is None
+            else optimality_criteria.sigmas(self.search.factor(balanced)) * self.information.units
         )
 
     @cached_property
@@ -171,7 +173,7 @@ class Plan:
     def slews_s(self) -> Floats:
         """Durations of the slews between the dwells (n - 1,), s, preceded by that to the first if the present pose is
         known."""
-        last = self.prospect.last
+        last = self.information.last
         way = self.poses if last is None else np.vstack([last.pose, self.poses])
         return slews_s(way[1:], way[:-1], self.timing.slew_degps)
 
@@ -184,10 +186,10 @@ class Plan:
     def remarks(self) -> list[str]:
         """One sentence on each thing that a reader of the plan must know."""
         sentences = list[str]()
-        through = int(self.search.reach.crosses(self.poses[:-1], self.poses[1:]).sum())
+        through = int(self.search.limits.crosses(self.poses[:-1], self.poses[1:]).sum())
         if through:
             sentences.append(f"{through} of the slews would lead straight through a forbidden zone: go round it.")
-        if self.correlation > self.timing.correlation + 0.005 and len(self.poses) > 1 and self.prospect.last is None:
+        if self.correlation > self.timing.correlation + 0.005 and len(self.poses) > 1 and self.information.last is None:
             sentences.append(
                 f"time goes with the direction of gravity (correlation {self.correlation:.2f}), so a drift would pass "
                 "for a change of the parameters: visit more orientations, or repeat them (--repeats 2)."
@@ -196,9 +198,9 @@ class Plan:
 
     def _weaknesses(self) -> Iterator[str]:
         """Yield the weaknesses of a plan that does not continue a run."""
-        if self.prospect.last is not None:
+        if self.information.last is not None:
             return
-        different, count = directions(self.directions), len(self.prospect.symbols)
+        different, count = directions(self.directions), len(self.information.symbols)
         left = 3 * different - count
         if left <= _LITTLE:
             over = f"only {left} is" if left > 0 else "nothing is"
@@ -210,7 +212,7 @@ class Plan:
         worst = int(np.argmax(worse))
         if worse[worst] > _WEAK:
             yield (
-                f"{self.prospect.symbols[worst]} is known {worse[worst]:.2g} times worse than by as many dwells in "
+                f"{self.information.symbols[worst]} is known {worse[worst]:.2g} times worse than by as many dwells in "
                 "directions that are spread, and what the model or the angles are off by goes into it as much: widen "
                 "what the gimbals reach (--limit, --forbid, --positions), or choose another --criterion."
             )
@@ -223,14 +225,14 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         raise InputError(f"{count} dwells are no whole number of {copies} visits each: ask for a multiple of {copies}.")
     with one_blas_thread():
         search.refuse_unseen()
-        adaptive = count == 1 and search.prospect.last is not None
+        adaptive = count == 1 and search.information.last is not None
         chosen = search.next()[None] if adaptive else search.best(count // copies)
         poses = _rounded(search, search.scheme.visits(chosen))
-        last, bench = search.prospect.last, search.prospect.model.bench
+        last, bench = search.information.last, search.information.model.bench
         force = bench.specific_force(np.zeros(len(poses)), poses)
-        poses = poses[order(poses, force, timing, search.reach, last.pose if last else None, seed)]
+        poses = poses[order(poses, force, timing, search.limits, last.pose if last else None, seed)]
         ordered = Plan(search, poses, timing)
-        if search.reach.continuous and bench.reference == "inertial" and copies == 1:
+        if search.limits.continuous and bench.reference == "inertial" and copies == 1:
             sequence = replace(search, at_s=ordered.at_s)  # gravity turns with the Earth during the plan
             ordered = Plan(search, _rounded(search, sequence.polish(ordered.poses)), timing)
         _refuse_unseen(ordered)
@@ -270,34 +272,34 @@ def fewest(search: Search, timing: Timing, seed: int = 0) -> Plan:
     return plan(search, count * copies, timing, seed)
 
 
-def papers_covariances(prospect: Prospect) -> Floats:
+def papers_covariances(information: PredictedInformation) -> Floats:
     """Covariances (3, 4, 4) in SI of each accelerometer's four parameters from its own four orientations in the paper's
     optimal set."""
-    parameters = paper_parameters.nominal(prospect.model.bench.nominal)
-    force = prospect.model.bench.gravity_mps2 * paper_parameters.optimal_directions(parameters)
+    parameters = paper_parameters.nominal(information.model.bench.nominal)
+    force = information.model.bench.gravity_mps2 * paper_parameters.optimal_directions(parameters)
     design = paper_parameters.design(force, parameters)
     inverse = np.linalg.inv(np.swapaxes(design, 1, 2) @ design)
-    return inverse * (prospect.noise.effective_sigma_mps2**2 / prospect.readings)[:, None, None]
+    return inverse * (information.noise.effective_sigma_mps2**2 / information.readings)[:, None, None]
 
 
-def papers_sigma(prospect: Prospect) -> Floats:
+def papers_sigma(information: PredictedInformation) -> Floats:
     """Sigmas (12,) in SI from the paper's optimal set."""
-    return np.sqrt(np.einsum("ijj->ij", papers_covariances(prospect))).ravel()
+    return np.sqrt(np.einsum("ijj->ij", papers_covariances(information))).ravel()
 
 
 def _rounded(search: Search, poses: Floats) -> Floats:
     """Return angles rounded to what can be dialled, within the limits."""
-    if not search.reach.continuous:
+    if not search.limits.continuous:
         return poses
     rounded = np.radians(np.degrees(poses).round(_DIGITS))
-    low, high = search.reach.bounds.T
+    low, high = search.limits.bounds.T
     rounded = np.clip(rounded, low, high)
-    return np.where(search.reach.allowed(rounded)[:, None], rounded, poses)
+    return np.where(search.limits.allowed(rounded)[:, None], rounded, poses)
 
 
 def _refuse_unseen(plan: Plan) -> None:
     """Raise UnobservableError if the plan leaves parameters undetermined."""
     lost = optimality_criteria.is_unseen(plan.factors[-1])
     if lost.any():
-        names = ", ".join(symbol for symbol, own in zip(plan.prospect.symbols, lost, strict=True) if own)
+        names = ", ".join(symbol for symbol, own in zip(plan.information.symbols, lost, strict=True) if own)
         raise UnobservableError(f"{len(plan.poses)} dwells leave {names} undetermined: plan more of them (--count).")

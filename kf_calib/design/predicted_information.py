@@ -64,7 +64,7 @@ class Last:
 
 
 @dataclass(frozen=True)
-class Prospect:
+class PredictedInformation:
     """The expected measurements of future dwells.
 
     - model, state (p,): what is estimated, and where it is linearised.
@@ -84,8 +84,8 @@ class Prospect:
     pause_s: float = PAUSE_S
 
     @classmethod
-    def of_bench(cls, bench: Bench, sigma_mps2: float, readings: float, dwell_s: float) -> Prospect:
-        """The prospect of a run that has not begun: nothing is known, and dwells scatter as the bench states."""
+    def of_bench(cls, bench: Bench, sigma_mps2: float, readings: float, dwell_s: float) -> PredictedInformation:
+        """The information of a run that has not begun: nothing is known, and dwells scatter as the bench states."""
         model = Model(bench)
         scatter = np.full(3, bench.scatter_sigma_mps2 or 0.0)
         setting_rad = math.radians(bench.angle_sigma_deg or 0.0)
@@ -94,8 +94,8 @@ class Prospect:
         return cls(model, model.nominal_state(), noise, readings, dwell_s, np.zeros((model.count, model.count)))
 
     @classmethod
-    def following(cls, fitted: Fit) -> Prospect:
-        """The prospect after a run so far, with dwells like those of the run; the information from the run is not
+    def following(cls, fitted: Fit) -> PredictedInformation:
+        """The information after a run so far, with dwells like those of the run; the information from the run is not
         included."""
         linearised, last = fitted.linearised, fitted.dwells[-1]
         dwell_s = float(np.median(np.diff(fitted.dwells.folded.ends_s)))
@@ -107,8 +107,8 @@ class Prospect:
         return cls(linearised.model, linearised.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
 
     @classmethod
-    def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
-        """The prospect after a run so far, with the information from it: the filter's own factor."""
+    def after(cls, fitted: Fit, prior: Prior | None = None) -> PredictedInformation:
+        """The information after a run so far, with the information from it: the filter's own factor."""
         linearised, noise, following = fitted.linearised, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
         first = square_root_information.start(prior or Prior(), linearised.model)
         steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
@@ -125,7 +125,7 @@ class Prospect:
 
     @cached_property
     def transform(self) -> Floats:
-        """The Jacobian d affine state / d state of the prospect, (p, p)."""
+        """The Jacobian d affine state / d state of the information, (p, p)."""
         jacobian = np.diag(self.units)
         twelve = paper_parameters.sensitivity_jacobian(paper_parameters.parameters_of(self.state[:STATE_COUNT]))
         jacobian[:STATE_COUNT, :STATE_COUNT] = twelve * self.units[:STATE_COUNT]
@@ -133,7 +133,7 @@ class Prospect:
 
     @cached_property
     def start(self) -> Floats:
-        """Information factor (p, p) of what is known already, for the states of the prospect."""
+        """Information factor (p, p) of what is known already, for the states of the information."""
         return triangle(self.known @ self.transform)
 
     @property

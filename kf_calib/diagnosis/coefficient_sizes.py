@@ -19,7 +19,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus
+from kf_calib.effects import Coefficient, Effect, RotationEffect, Stimulus
 from kf_calib.effects.effect import Grade, Typical
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
@@ -143,7 +143,7 @@ def _reason(effect: Effect, stimulus: Stimulus) -> str:
 
 def _needs_angles(effect: Effect, stimulus: Stimulus) -> bool:
     """Tell whether an effect would have columns if some attitude were known."""
-    if isinstance(effect, FrameEffect):
+    if isinstance(effect, RotationEffect):
         return True
     poses = np.random.default_rng(1).normal(size=stimulus.pose.shape)
     return bool(effect_columns([effect], replace(stimulus, pose=poses, previous_pose=poses)).any())

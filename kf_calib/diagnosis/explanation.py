@@ -17,7 +17,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of, misfit_beyond_noise, unexplained_mps2, walk_path
 from kf_calib.diagnosis.unknown_effect import explained_share
-from kf_calib.effects import Effect, FrameEffect, Stimulus
+from kf_calib.effects import Effect, RotationEffect, Stimulus
 from kf_calib.effects.inputs import axis_of, is_formula, turned_gimbal
 from kf_calib.effects.stimulus import smooth_between
 from kf_calib.estimation.residual_table import mean_sigmas, means_over_dwells
@@ -93,7 +93,7 @@ def shapes_of(before: Calibration, after: Calibration) -> list[EffectShape]:
 
 def _drawn_together(effect: Effect) -> tuple[str, int | None]:
     """Return what effects that are next to each other have in common if they are drawn as one."""
-    gimbal = effect.gimbal if isinstance(effect, FrameEffect) else None
+    gimbal = effect.gimbal if isinstance(effect, RotationEffect) else None
     return (type(effect).__name__ if is_formula(effect) else str(effect)), gimbal
 
 
@@ -112,7 +112,7 @@ def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -
                               * before.bench.gravity_mps2)  # fmt: skip
     else:
         words, symbol, unit, values = "what the fit of it adds", "", "m/s^2", component
-    if gimbal and isinstance(effects[0], FrameEffect):
+    if gimbal and isinstance(effects[0], RotationEffect):
         lever, quantity, values = _lever(after, effects[0].about), "rad", values[:, :1]
         component, residuals, left = (_turn(each, lever, sigmas[0]) for each in (component, residuals, left))
         lengths = np.linalg.norm(lever, axis=1, keepdims=True)
@@ -132,7 +132,7 @@ def bars_of(result: Calibration) -> tuple[Floats, Floats]:
 
 
 def _framed(effects: Sequence[Effect]) -> bool:
-    return all(isinstance(effect, FrameEffect) for effect in effects)
+    return all(isinstance(effect, RotationEffect) for effect in effects)
 
 
 def _name(effects: Sequence[Effect]) -> str:

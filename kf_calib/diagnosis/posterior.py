@@ -54,6 +54,7 @@ from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, tren
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import CLEAR, LEVEL, chi_squared_tail, log_odds_of
+from kf_calib.support.text import listing
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _BESIDE = 2  # rows of effects, and of unknown functions, beside which dwells are tried
@@ -277,7 +278,7 @@ class RunPosterior:
         likeliest = max((log for log, _ in found), default=0.0)
         for log, places in ((log, places) for log, places in found if log > likeliest - _BEHIND):
             numbers = self._numbers(places)
-            words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, sorted(numbers)))} alone"
+            words = f"dwell{'s' * (len(numbers) > 1)} {listing(map(str, sorted(numbers)))} alone"
             rows.append(Hypothesis(driver=words, families=(NONE,), log_evidence=log, dwells=numbers))
         return rows
 

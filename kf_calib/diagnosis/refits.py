@@ -68,7 +68,7 @@ class Refits:
         others = dwells.without(np.flatnonzero(np.isin(dwells.folded.numbers, numbers)).tolist())
         try:
             fitted = fit(others, before.model, settings.walk_mps2_per_sqrt_s, slews)
-            return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+            return replace(evaluate_fit(fitted, settings), counts=before.counts, readings=before.readings)
         except (InputError, UnobservableError):
             return None
 
@@ -94,7 +94,7 @@ class Refits:
             fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews, must_settle=False, beginning=beginning)
             if self.source is not None and not holds_its_oscillation(fitted):
                 return calibrate(self.source, settings, plain=None if dwells.folded.averaged else fitted)
-            refitted = replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+            refitted = replace(evaluate_fit(fitted, settings), counts=before.counts, readings=before.readings)
             refuse_unseen(refitted)
             return refitted
 
@@ -154,7 +154,7 @@ def with_noise_beside_oscillation(refits: Refits, before: Calibration) -> Calibr
         return None
     noise = replace(before.noise, sigma_mps2=beside.sigma_mps2, inflation=beside.inflation)
     quieter = evaluate_fit(replace(before.fit, noise=noise), before.settings)
-    return replace(quieter, tally=before.tally, readings=before.readings)
+    return replace(quieter, counts=before.counts, readings=before.readings)
 
 
 def _power(noise: Noise) -> Floats:

@@ -22,7 +22,7 @@ from kf_calib.estimation.filter_history import DwellReadings
 from kf_calib.estimation.results import Calibration, Condition, OutlyingDwell, Parameter
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.tail_probabilities import chi_squared_tail
-from kf_calib.support.text import as_html, printed
+from kf_calib.support.text import as_html, listing, printed
 from kf_calib.support.units import span
 
 _TOLD_APART = 4  # most rivals that the next orientation is to tell from the likeliest effect
@@ -224,7 +224,7 @@ class Diagnosis:
             advice = advise.to_tell_apart(fitted, first.effect, test.effects.scan.coefficients(first), rivals)
             if advice is None:
                 return None
-            words = f"tells {named[0]} from {' and '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
+            words = f"tells {named[0]} from {listing(advice.told)}" if advice.told else f"shows {named[0]} best"
             stay = "" if advice.stay_s is None else f" after {span(advice.stay_s)} there"
             return advice, f"{words}: by {advice.after:.1f} sigma{stay}, {advice.before:.1f} without it"
         hidden = [test.effects.candidate(name).effect for name in test.invisible if name in test.effects.best]

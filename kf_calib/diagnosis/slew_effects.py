@@ -24,7 +24,7 @@ def of_slews(refits: Refits, before: Calibration) -> tuple[HypothesisTable, floa
     none does, or where no slews can be read."""
     known = {str(effect) for effect in before.model.effects}
     names = [name for name in slew_effects(before.bench) if name not in known]
-    if refits.source is None or not before.bench.angles or before.tally.moving < _FEWEST or not names:
+    if refits.source is None or not before.bench.angles or before.counts.moving < _FEWEST or not names:
         return None
     try:
         together = refits.with_effects(before, names)

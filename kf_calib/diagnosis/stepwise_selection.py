@@ -35,7 +35,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.text import as_html
+from kf_calib.support.text import as_html, listing
 from kf_calib.support.units import si
 
 _NEAR_THRESHOLD = 8.0  # sigma; an effect near the threshold is found only if noise enlarges it: estimates are too large
@@ -212,7 +212,7 @@ class Improvement:
     @cached_property
     def reason(self) -> str:
         """The same in one or two sentences."""
-        verdict, names = self.diagnosis.verdict, " and ".join(each.name for each in self.alternatives)
+        verdict, names = self.diagnosis.verdict, listing(each.name for each in self.alternatives)
         differ = self._difference
         rivals = _rivals(self.diagnosis)
         if rivals and self.because == "ambiguous":

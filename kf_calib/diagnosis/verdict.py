@@ -22,7 +22,7 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.text import counted
+from kf_calib.support.text import counted, listing
 from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
@@ -120,7 +120,7 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
         names.append("the lines in their spectrum")
     if not names:
         return ""
-    return f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording itself."
+    return f" A second pass over the readings is needed to judge {listing(names)}: diagnose the recording itself."
 
 
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -162,7 +162,7 @@ def _known_beside(diagnosis: Diagnosis, first: Hypothesis) -> list[tuple[str, st
     """Return the known effects that may be missing beside those that are named, with their probabilities."""
     assert diagnosis.table is not None
     rows = [row for row in diagnosis.table.listed if set(first.effects) < set(row.effects)]
-    names = [" and ".join(name for name in row.effects if name not in first.effects) for row in rows]
+    names = [listing(name for name in row.effects if name not in first.effects) for row in rows]
     return [(each, format_probability(row.probability)) for each, row in zip(names, rows[:_TOLD], strict=False)]
 
 
@@ -259,7 +259,7 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on noise from dwell to dwell that was not stated, and on how to be sure of it."""
     noise = diagnosis.before.noise
     stated = ("angle_sigma_deg", noise.setting.stated), ("scatter_sigma_mps2", noise.scatter.stated)
-    keys = " and ".join(f"{key}{_USUAL[key]}" for key, is_stated in stated if not is_stated)
+    keys = listing(f"{key}{_USUAL[key]}" for key, is_stated in stated if not is_stated)
     what = "more than was stated" if dwell_noise_is_stated(diagnosis.before) else "by an amount that was not stated"
     advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
     share = format_probability(first.probability)
@@ -293,7 +293,7 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
     if first is None or diagnosis.table is None:
         return ""
     if diagnosis.sure:
-        return f"missing: {' and '.join(diagnosis.missing)} {_share(diagnosis)}"
+        return f"missing: {listing(diagnosis.missing)} {_share(diagnosis)}"
     rows = [first, *diagnosis.table.rivals[: _TOLD - 1]]
     text = ", ".join(f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows)
     return f"suspects {text}" if first.effects else text
@@ -312,7 +312,7 @@ def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
 
 def _effects_of(row: Hypothesis) -> str:
     """Return the effects of a row in words."""
-    return row.effects[0] if len(row.effects) == 1 else f"{' and '.join(row.effects)} together"
+    return row.effects[0] if len(row.effects) == 1 else f"{listing(row.effects)} together"
 
 
 def format_probability(probability: float) -> str:

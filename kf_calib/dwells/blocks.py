@@ -136,7 +136,7 @@ class Block:
 
 
 @dataclass
-class Tally:
+class SampleCounts:
     """Counts of what became of every sample that was read; ``sentences`` reports those that a user should know.
 
     - slewing: readings of slews that were used; moving: readings not used because the platform moved.
@@ -245,7 +245,7 @@ class StampOrder:
         self._held_back = Stream.empty(0)
         self._ended = False
 
-    def __call__(self, stream: Stream, tally: Tally | None = None, first_ns: int | None = None) -> Stream:
+    def __call__(self, stream: Stream, counts: SampleCounts | None = None, first_ns: int | None = None) -> Stream:
         if self._held_back.time_ns.size:
             stream, self._held_back = self._held_back + stream, Stream.empty(0)
         if not len(stream):
@@ -255,27 +255,27 @@ class StampOrder:
         if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < LEAP_NS:
             self.last_ns = int(stream.time_ns[-1])
             return stream
-        return self._one_by_one(stream, tally or Tally(), first_ns)
+        return self._one_by_one(stream, counts or SampleCounts(), first_ns)
 
-    def _one_by_one(self, stream: Stream, tally: Tally, first_ns: int | None) -> Stream:
+    def _one_by_one(self, stream: Stream, counts: SampleCounts, first_ns: int | None) -> Stream:
         """Check the stamps one at a time, as needed where one is out of order or far ahead."""
         stamps: list[int] = stream.time_ns.tolist()
         keep = np.zeros(len(stamps), bool)
         for i, stamp in enumerate(stamps):
             if self.last_ns is not None and stamp <= self.last_ns:
                 if stamp == self.last_ns:
-                    tally.repeated += 1
+                    counts.repeated += 1
                 else:
-                    tally.backward += 1
-                    if tally.first_backward_s is None:
-                        tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / SECOND_NS
+                    counts.backward += 1
+                    if counts.first_backward_s is None:
+                        counts.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / SECOND_NS
                 continue
             if self.last_ns is not None and stamp - self.last_ns >= LEAP_NS:
                 if i + 1 == len(stamps) and not self._ended:  # the next stamp tells a gap from damage
                     self._held_back = stream[i:]
                     break
                 if i + 1 < len(stamps) and stamps[i + 1] < stamp:
-                    tally.leaping += 1
+                    counts.leaping += 1
                     continue
             keep[i] = True
             self.last_ns = stamp

@@ -204,7 +204,7 @@ def of_all_pieces(columns: Sequence[Floats]) -> Floats:
     return columns.values if isinstance(columns, OfPieces) else np.concatenate(columns)
 
 
-def basis_values(columns: Floats) -> Floats:
+def basis_coefficients(columns: Floats) -> Floats:
     """Coefficients (..., K, 3 c) on the basis functions of columns (..., K, 3, c) given at the nodes."""
     return on_basis(columns.reshape(*columns.shape[:-2], -1))
 

@@ -27,7 +27,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import SECOND_NS, Batch, Source, Stream
-from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally, carry_on
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, SampleCounts, carry_on
 from kf_calib.dwells.limits import FEWEST_COMPARED, SAMPLE, SIGMAS
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.stationarity import READING_WINDOW_NS, Stillness
@@ -89,7 +89,7 @@ class RestSegmenter(Segmenter):
         if self._run is None or self._run.number is None:
             return []
         aside = copy.copy(self)
-        aside.tally = Tally()
+        aside.counts = SampleCounts()
         return list(aside._close(copy.copy(self._run), departed=True))
 
     def _blocks_of_windows(self, final: bool) -> Iterator[Block]:
@@ -176,13 +176,13 @@ class RestSegmenter(Segmenter):
         length_ns = run.end_ns - run.arrival_ns
         settle_ns = min(self.stillness.settle_ns, length_ns // 3) if run.begin else 0
         if run.begin and settle_ns < self.stillness.settle_ns:
-            self.tally.short_dwells += 1
-            self.tally.least_settling_s = min(self.tally.least_settling_s, settle_ns / SECOND_NS)
+            self.counts.short_dwells += 1
+            self.counts.least_settling_s = min(self.counts.least_settling_s, settle_ns / SECOND_NS)
         self._settle(run, settle_ns)
         end = self._index(run.end_ns - min(self.stillness.lead_ns, length_ns // 10)) if departed else run.end
         while self._dropped < end:
             yield self._next_block(run, min(BLOCK_SAMPLES, end - self._dropped))
-        self.tally.settling += run.end - self._dropped
+        self.counts.settling += run.end - self._dropped
         self._release(run.end - self._dropped)
 
     def _settle(self, run: _StillRun, settle_ns: int) -> None:
@@ -191,7 +191,7 @@ class RestSegmenter(Segmenter):
             return
         run.settled = True
         count = self._index(run.arrival_ns + settle_ns) - self._dropped
-        self.tally.settling += count
+        self.counts.settling += count
         self._release(count)
 
     def _next_block(self, run: _StillRun, count: int) -> Block:
@@ -199,7 +199,7 @@ class RestSegmenter(Segmenter):
         assert run.number is not None
         readings = self._accel[:count]
         self._release(count)
-        self.tally.used += count
+        self.counts.used += count
         times_s, temperature_c = self._elapsed_s(readings.time_ns), carry_on(self._temperature, readings.time_ns)
         return Block(
             run.number, self._elapsed_s(run.arrival_ns), times_s, readings.values, _ANY_ATTITUDE, temperature_c
@@ -209,7 +209,7 @@ class RestSegmenter(Segmenter):
         """Release and count the readings before a place that are in no dwell."""
         run = self._run
         if run is None or run.number is None:
-            self.tally.moving += max(index - self._dropped, 0)
+            self.counts.moving += max(index - self._dropped, 0)
             self._release(max(index - self._dropped, 0))
 
     def _release(self, count: int) -> None:
@@ -232,11 +232,11 @@ class RestSegmenter(Segmenter):
 
 
 def segmenter_of(
-    bench: Bench, stillness: Stillness | None = None, tally: Tally | None = None, slews: bool = False
+    bench: Bench, stillness: Stillness | None = None, counts: SampleCounts | None = None, slews: bool = False
 ) -> Segmenter:
     """The segmenter of a bench: by its angles, or by the readings alone where no angles are used."""
     kind = Segmenter if bench.angles else RestSegmenter
-    return kind(bench, stillness or Stillness(), tally or Tally(), slews and bench.angles)
+    return kind(bench, stillness or Stillness(), counts or SampleCounts(), slews and bench.angles)
 
 
 @dataclass(frozen=True)

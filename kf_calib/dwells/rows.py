@@ -17,7 +17,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.blocks import Block, Curve, Tally
+from kf_calib.dwells.blocks import Block, Curve, SampleCounts
 from kf_calib.dwells.limits import FEWEST_READINGS, SAMPLE, SIGMAS
 from kf_calib.dwells.window_average import average
 from kf_calib.support.tail_probabilities import normal_quantile
@@ -155,7 +155,11 @@ class Rows:
 
 
 def model_rows(
-    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = SIGMAS, window_s: float = 0.0
+    blocks: Iterable[Block],
+    bench: Bench,
+    counts: SampleCounts,
+    gate_sigma: float | None = SIGMAS,
+    window_s: float = 0.0,
 ) -> Iterator[Rows]:
     """Rows of every block, without outliers; both engines and batch least squares work on the same rows.
 
@@ -181,7 +185,7 @@ def model_rows(
         if gate_sigma is not None and (not window_s or len(rows.readings) >= SAMPLE):
             keep = inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
-                tally.gated += int((~keep).sum())
+                counts.gated += int((~keep).sum())
                 rejected = rows.innovation[:, ~keep]
                 block = block[keep]
                 rows = _rows(block, bench, force)

@@ -31,8 +31,8 @@ from kf_calib.dwells.blocks import (
     Curve,
     DwellEvent,
     OpenDwell,
+    SampleCounts,
     StampOrder,
-    Tally,
     carry_on,
     within,
 )
@@ -54,7 +54,7 @@ class Segmenter:
 
     bench: Bench
     stillness: Stillness = field(default_factory=Stillness)
-    tally: Tally = field(default_factory=Tally)
+    counts: SampleCounts = field(default_factory=SampleCounts)
     slews: bool = False
 
     def __post_init__(self) -> None:
@@ -115,24 +115,24 @@ class Segmenter:
         if self._dwell is None or horizon is None:
             return []
         aside = copy.copy(self)
-        aside.tally, aside._dwell = Tally(), replace(self._dwell)
+        aside.counts, aside._dwell = SampleCounts(), replace(self._dwell)
         return list(aside._emit(horizon, closing=True))
 
     def _take(self, batch: Batch, final: bool = False) -> None:
         """Add a batch to the samples that wait to be judged; at the end it consists of samples that were held back
         before."""
         if not final:
-            self.tally.read += len(batch.accel)
+            self.counts.read += len(batch.accel)
         self._take_readings(batch.accel)
         if final:
             lasted_ns = (self._orders[0].last_ns or 0) - (self.first_ns or 0)
-            self.tally.look_for_trouble(self._first, lasted_ns / SECOND_NS)
+            self.counts.look_for_trouble(self._first, lasted_ns / SECOND_NS)
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
             readable = within(warm.values, LARGEST)
             if readable is not None:
-                self.tally.temperatures_dropped += int((~readable).sum())
+                self.counts.temperatures_dropped += int((~readable).sum())
                 warm = warm[readable]
             self._temperature += self._orders[2](warm)
 
@@ -143,10 +143,10 @@ class Segmenter:
         readable = within(accel.values, LARGEST_MPS2)
         if readable is not None:
             too_large = int(np.isfinite(accel.values[~readable]).all(axis=1).sum())
-            self.tally.too_large += too_large
-            self.tally.not_finite += int((~readable).sum()) - too_large
+            self.counts.too_large += too_large
+            self.counts.not_finite += int((~readable).sum()) - too_large
             accel = accel[readable]
-        accel = self._orders[0](accel, self.tally, self.first_ns)
+        accel = self._orders[0](accel, self.counts, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
         if len(self._first) < BLOCK_SAMPLES:
@@ -160,12 +160,12 @@ class Segmenter:
         stream was delivered first.
         """
         if len(pose):
-            usable, counts = self._usable(pose.values), Tally()
+            usable, counts = self._usable(pose.values), SampleCounts()
             pose = self._orders[1](pose[usable], counts)
-            self.tally.poses += len(pose)
-            self.tally.poses_dropped += int((~usable).sum()) + counts.repeated + counts.backward + counts.leaping
+            self.counts.poses += len(pose)
+            self.counts.poses_dropped += int((~usable).sum()) + counts.repeated + counts.backward + counts.leaping
             if self.bench.axes:
-                self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
+                self.counts.farthest_rad = max(self.counts.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
         self._early_poses += [pose] if len(pose) else []
         reached_ns = LAST_NS if final else self._orders[0].last_ns
         if not self._early_poses or reached_ns is None or self._early_poses[0].time_ns[0] > reached_ns:
@@ -180,7 +180,7 @@ class Segmenter:
         self._last_recorded = pose.values[-1], turns[-1]
         pose = Stream(pose.time_ns, continuous)
         noise_rad = self._noise.of_next(pose)
-        self.tally.noise_rad = max(self.tally.noise_rad, float(noise_rad.max(initial=0.0)))
+        self.counts.noise_rad = max(self.counts.noise_rad, float(noise_rad.max(initial=0.0)))
         self._pose, self._noise_rad = self._pose + pose, np.concatenate([self._noise_rad, noise_rad])
         self._turns = np.concatenate([self._turns, turns])
 
@@ -221,7 +221,7 @@ class Segmenter:
             self._discard(horizon if final or before < 0 else min(horizon, int(self._pose.time_ns[before])))
         self._forget()
         if final:
-            self.tally.without_pose += len(self._accel)
+            self.counts.without_pose += len(self._accel)
             self._accel = Stream.empty(3)
 
     def _judge(self, final: bool) -> list[tuple[int, DwellEvent, bool]]:
@@ -327,8 +327,8 @@ class Segmenter:
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -LAST_NS
         early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
-        self.tally.without_pose += early
-        self.tally.moving += count - early
+        self.counts.without_pose += early
+        self.counts.moving += count - early
         self._accel = self._accel[count:]
 
     def _slewing(self) -> bool:
@@ -365,7 +365,7 @@ class Segmenter:
         )
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
             yield slew[part]
-        self.tally.slewing += count
+        self.counts.slewing += count
         self._accel = self._accel[count:]
 
     def _emit(self, until_ns: int, closing: bool, departed: bool = False) -> Iterator[Block]:
@@ -384,13 +384,13 @@ class Segmenter:
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
             if settle_ns > length_ns // 3 and departed:
-                self.tally.short_dwells += 1
-                self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / SECOND_NS)
+                self.counts.short_dwells += 1
+                self.counts.least_settling_s = min(self.counts.least_settling_s, length_ns // 3 / SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
         if closing and dwell.pose is None and self._encoder_noise_unknown(self._accel.time_ns[first:count]):
             first = count
-        self.tally.settling += first
+        self.counts.settling += first
         while count - first >= BLOCK_SAMPLES or (closing and count > first):
             size = min(BLOCK_SAMPLES, count - first)
             yield self._block(self._accel[first : first + size])
@@ -407,7 +407,7 @@ class Segmenter:
     def _block(self, accel: Stream) -> Block:
         """Make a block of the open dwell from these readings."""
         assert self._dwell is not None
-        self.tally.used += len(accel)
+        self.counts.used += len(accel)
         arrivals_ns = self._dwell.arrival_ns, self._dwell.arrival_felt_ns
         arrival_s, arrival_felt_s = (max(self._elapsed_s(stamp_ns), 0.0) for stamp_ns in arrivals_ns)
         pose, temperature_c = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
@@ -438,7 +438,7 @@ class Segmenter:
         if not self.stillness.creeps(inside, not self.bench.axes):
             return self._standing_pose(inside)
         turned_rad = float(pose_distance(inside[-1], inside[0], not self.bench.axes))
-        self.tally.turned_deg = max(self.tally.turned_deg, math.degrees(turned_rad))
+        self.counts.turned_deg = max(self.counts.turned_deg, math.degrees(turned_rad))
         around = slice(max(first - 1, first_of_dwell), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
 

@@ -17,13 +17,13 @@ from pathlib import Path
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import checks, drift, formula, frame, sensor, user
 from kf_calib.effects.effect import Bearer, Coefficient, Effect, SensorEffect, Unknown
-from kf_calib.effects.frame import FrameEffect
+from kf_calib.effects.frame import RotationEffect
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.effects.user import Program
 from kf_calib.errors import InputError
 
 __all__ = [
-    "Bearer", "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "described",
+    "Bearer", "Coefficient", "Effect", "RotationEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "described",
     "effect_named", "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of", "programs_of",
     "refuse_unfit", "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
 ]  # fmt: skip

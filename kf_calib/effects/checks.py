@@ -15,7 +15,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of, turned
 from kf_calib.effects.effect import Effect
-from kf_calib.effects.frame import FrameEffect
+from kf_calib.effects.frame import RotationEffect
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError
 
@@ -73,7 +73,7 @@ def check_effect(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
 
     Raises InputError, in one sentence with effect, check and values, where the columns have another shape than
     (m, 3, q), are not finite, or all zero; where they change the stimulus; and where a derivative is claimed (of a
-    turned specific force by a FrameEffect, for its unknown by any) that differences do not give.
+    turned specific force by a RotationEffect, for its unknown by any) that differences do not give.
     """
     s = trial(EXAMPLE) if s is None else s
     coefficients = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
@@ -82,7 +82,7 @@ def check_effect(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
         raise InputError(f"{effect} gives two coefficients the same symbol ({' '.join(symbols)}): tell them apart.")
     count, before = len(coefficients), _arrays(s)
     before = {name: values.copy() for name, values in before.items()}
-    if isinstance(effect, FrameEffect):
+    if isinstance(effect, RotationEffect):
         _rotations(effect, s, count)
     columns = np.asarray(_call(effect, "columns", effect.columns, s))
     _refuse_shape(effect, columns, (len(s), 3, count))
@@ -92,7 +92,7 @@ def check_effect(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
             raise InputError(f"{effect} writes into {name} of the stimulus: work on a copy, other effects read it too.")
     if count and not columns.any():
         raise InputError(f"{effect} adds nothing to any reading in {len(s)} spread instants: check its terms.")
-    if isinstance(effect, FrameEffect):
+    if isinstance(effect, RotationEffect):
         _refuse_wrong_derivative(effect, columns, s)
     if effect.unknown is not None and type(effect).derivative is not Effect.derivative:
         _refuse_wrong_slope(effect, s, count)
@@ -176,7 +176,7 @@ def _refuse_shape(effect: Effect, columns: Floats, shape: tuple[int, int, int]) 
         raise InputError(f"{effect}: its columns are of the type {columns.dtype}, not real numbers.")
 
 
-def _rotations(effect: FrameEffect, s: Stimulus, count: int) -> Floats:
+def _rotations(effect: RotationEffect, s: Stimulus, count: int) -> Floats:
     rotations = np.asarray(_call(effect, "rotations", effect.rotations, s))
     shape = (len(s), count, 3)
     if rotations.shape != shape:
@@ -186,7 +186,7 @@ def _rotations(effect: FrameEffect, s: Stimulus, count: int) -> Floats:
     return rotations
 
 
-def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) -> None:
+def _refuse_wrong_derivative(effect: RotationEffect, columns: Floats, s: Stimulus) -> None:
     """Columns against (s_i . f turned by alpha - s_i . f turned by -alpha) / 2, alpha a small finite rotation."""
     rotations = _rotations(effect, s, columns.shape[2])
     for k, rotation in enumerate(np.moveaxis(rotations, 1, 0)):
@@ -200,7 +200,7 @@ def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) 
             raise InputError(
                 f"{effect}: column {k + 1} is {columns[row, i, k]:.4g} m/s^2 for accelerometer {i + 1} at "
                 f"{s.elapsed_s[row]:.4g} s, and a small finite rotation by its rotations gives {expected[row, i]:.4g}: "
-                "leave columns to FrameEffect."
+                "leave columns to RotationEffect."
             )
 
 

@@ -1,7 +1,7 @@
 """What an effect is: a name, coefficients with unit and scale, and columns over the stimulus.
 
 Two kinds cover the catalogue: a ``SensorEffect`` has one coefficient for each accelerometer and says what it adds to a
-reading per unit of it; a ``FrameEffect`` (``effects.frame``) turns the platform by a small rotation per unit of each
+reading per unit of it; a ``RotationEffect`` (``effects.frame``) turns the platform by a small rotation per unit of each
 coefficient, common to the three accelerometers. A new effect is a class with a docstring, and a formula or one method.
 """
 

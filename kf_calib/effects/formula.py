@@ -43,7 +43,7 @@ from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Bearer, SensorEffect, interleaved
 from kf_calib.effects.expression import LAG, VALUES, Expression
-from kf_calib.effects.frame import FrameEffect, gimbal_number
+from kf_calib.effects.frame import RotationEffect, gimbal_number
 from kf_calib.effects.quantities import gimbal_letters, quantities
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
@@ -142,7 +142,11 @@ def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
 def _check(effect: Formula | FrameFormula, bench: Bench, large: float) -> None:
     """Give an effect its units, what its checks say, and the scale of its coefficients: with it, it adds ``large`` on a
     trial run. Raises InputError where it cannot be used."""
-    reading, stimulus, turning = effect.reading, _trial(bench.axes, bench.gravity_mps2), isinstance(effect, FrameEffect)
+    reading, stimulus, turning = (
+        effect.reading,
+        _trial(bench.axes, bench.gravity_mps2),
+        isinstance(effect, RotationEffect),
+    )
     unit, shown = _units(reading, turning)
     if turning and reading(stimulus).shape[1] != 1:
         words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."
@@ -176,7 +180,7 @@ class Formula(SensorEffect):
         return terms
 
 
-class FrameFormula(FrameEffect):
+class FrameFormula(RotationEffect):
     """An effect ``name:place = expression``: an error of a gimbal's angle, a tilt of the base about North and East, or
     a turn of the platform about its three axes.
 

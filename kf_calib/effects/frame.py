@@ -17,7 +17,7 @@ from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 
-class FrameEffect(Effect):
+class RotationEffect(Effect):
     """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
 
     A rotation vector rho changes the specific force f to exp([rho]) f. About a force that is turned by ``turned_rad``
@@ -80,7 +80,7 @@ def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
     return vectors + first * once + second * twice
 
 
-class BaseTilt(FrameEffect):
+class BaseTilt(RotationEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
 
     family = "base and platform"
@@ -112,7 +112,7 @@ class BaseTiltDrift(BaseTilt):
         return ""
 
 
-class PlatformDrift(FrameEffect):
+class PlatformDrift(RotationEffect):
     """The platform turned by omega_d t, three rates in its own frame."""
 
     family = "base and platform"
@@ -127,7 +127,7 @@ class PlatformDrift(FrameEffect):
         return -s.elapsed_s[:, None, None] * np.eye(3)
 
 
-class EarthRotation(FrameEffect):
+class EarthRotation(RotationEffect):
     """Gravity turning with the Earth in a platform that is held inertially while its angles are taken as base-fixed.
 
     The coefficient is the share of the Earth's rate, 1 where the platform is truly inertial.
@@ -144,7 +144,7 @@ class EarthRotation(FrameEffect):
         return (s.elapsed_s[:, None] * s.to_platform(s.bench.earth_rate_radps))[:, None, :]
 
 
-class Flexure(FrameEffect):
+class Flexure(RotationEffect):
     """The platform turns by f x d under the torque of gravity, d the compliance times the offset of its mass."""
 
     family = "base and platform"
@@ -193,7 +193,7 @@ class CrossTalk(Effect):
         return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"
 
 
-class _GimbalEffect(FrameEffect):
+class _GimbalEffect(RotationEffect):
     """An effect of one gimbal, named by its letter or number after the colon, which its symbols end in, too."""
 
     family, source = "gimbal and encoder", "geometry of the bench"

@@ -16,7 +16,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.effect import Effect, Regressor, SensorEffect
 from kf_calib.effects.formula import Formula, FrameFormula, Reading, quantities
-from kf_calib.effects.frame import FrameEffect, GravityError
+from kf_calib.effects.frame import GravityError, RotationEffect
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 
 _TRIALS = 64
@@ -54,7 +54,7 @@ def beyond_force_and_temperature(effect: Effect, bench: Bench) -> str:
 
     An effect of the platform is none of the sensor's, whatever it depends on: the sensor reads what it feels.
     """
-    if isinstance(effect, FrameEffect):
+    if isinstance(effect, RotationEffect):
         return "it is an error of the platform, not of the accelerometers"
     if isinstance(effect, GravityError):
         return "it is an error of the stated gravity, not of the accelerometers"
@@ -125,7 +125,7 @@ def is_formula(effect: Effect) -> bool:
 def turned_gimbal(effects: Sequence[Effect]) -> int:
     """The number, from 1, of the gimbal about which all the effects turn the platform, whatever their coefficients; 0
     where there is no such gimbal."""
-    gimbals = {effect.gimbal if isinstance(effect, FrameEffect) else None for effect in effects}
+    gimbals = {effect.gimbal if isinstance(effect, RotationEffect) else None for effect in effects}
     number = gimbals.pop() if len(gimbals) == 1 else None
     return 0 if number is None else 1 + number
 

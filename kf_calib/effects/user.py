@@ -34,8 +34,9 @@ from types import ModuleType
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Bearer, Effect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
-from kf_calib.effects.frame import FrameEffect
+from kf_calib.effects.frame import RotationEffect
 from kf_calib.errors import InputError
+from kf_calib.support.text import listing
 
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
 """Symbols of the paper's parameters, one or two of them never used: no effect may have them."""
@@ -69,7 +70,7 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
     classes = effect_classes(module)
     if not classes:
         raise InputError(
-            f"{path}: defines no effect: write a class that derives from SensorEffect, FrameEffect or Effect "
+            f"{path}: defines no effect: write a class that derives from SensorEffect, RotationEffect or Effect "
             "(from kf_calib.effects import SensorEffect)."
         )
     return classes
@@ -96,7 +97,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     elif kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
         missing = ["coefficients", *missing]
     if missing:
-        raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
+        raise InputError(f"{who} lacks {listing(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
     given = getattr(kind, "name", None)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", kind.__name__).lower() if given is None else given
     if not (isinstance(name, str) and is_name(name)):
@@ -108,7 +109,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
         if not hasattr(kind, key):
             setattr(kind, key, value)
     said_by = next(each for each in kind.__mro__ if "borne_by" in vars(each))
-    if said_by in (SensorEffect, FrameEffect):  # the shape of its columns does not say what has it
+    if said_by in (SensorEffect, RotationEffect):  # the shape of its columns does not say what has it
         kind.borne_by = Bearer.EITHER
     checks.guard(kind)
     return kind

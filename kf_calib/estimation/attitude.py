@@ -18,7 +18,7 @@ from kf_calib.bench.arrays import DIFFERENCE, ROUNDING, Floats, crossed
 from kf_calib.bench.bench import turn_by, turned
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.table import Attitudes, DwellTable
-from kf_calib.effects import Effect, FrameEffect, Stimulus
+from kf_calib.effects import Effect, RotationEffect, Stimulus
 from kf_calib.estimation.dwell_columns import FARTHEST_RAD, LinearisedDwells, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.means import Means
@@ -150,7 +150,7 @@ def bent_effects(model: Model, state: Floats) -> list[Effect]:
     return [
         effect
         for effect in model.effects
-        if not (isinstance(effect, FrameEffect) or effect.dynamic or effect.oscillates or effect.no_columns)
+        if not (isinstance(effect, RotationEffect) or effect.dynamic or effect.oscillates or effect.no_columns)
         and state[model.parts[str(effect)]].any()
     ]
 

@@ -22,7 +22,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import window_average
-from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.blocks import SampleCounts
 from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import of_the_users
@@ -105,7 +105,7 @@ def conclude(
     dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
         _refuse_absent(settings.left_out, passed.folded)
-        refuse_unusable(dwells, passed.tally, bench)
+        refuse_unusable(dwells, passed.counts, bench)
     stage.say("estimating")
     if again is not None and passed.model.oscillates:
         passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
@@ -144,12 +144,16 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     on_outlying = [outlying_in_words(outlying)] if outlying else []
     misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
     remarks = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
-    counted = [*passed.tally.sentences(), *passed.tally.unmet_settings(passed.settings.stillness)]
+    counted = [*passed.counts.sentences(), *passed.counts.unmet_settings(passed.settings.stillness)]
     notes += [f"{known.sentence}." for known in result.model.known]
     warnings = [*passed.source.warnings, *counted, *readings.warnings, *on_outlying, *remarks, *notes]
     agreement = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
     return result.changed(
-        tally=passed.tally, readings=readings, warnings=tuple(warnings), outlying=outlying, consistency=agreement
+        counts=passed.counts,
+        readings=readings,
+        warnings=tuple(warnings),
+        outlying=outlying,
+        consistency=agreement,
     )
 
 
@@ -185,7 +189,7 @@ def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     judged = judged_with_trend(fitted)
     return Calibration(
         model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
-        Tally(), tuple(remarks_on(linearised, noise, final, judged, residuals)),
+        SampleCounts(), tuple(remarks_on(linearised, noise, final, judged, residuals)),
     )  # fmt: skip
 
 
@@ -257,7 +261,7 @@ def refuse_unseen(result: Calibration) -> None:
         dwells = (
             "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
         )
-        moving = result.tally.moving / max(result.tally.read, 1)
+        moving = result.counts.moving / max(result.counts.read, 1)
         restless = (
             f" {moving:.0%} of the readings count as moving: if the platform stood still in them, raise --still-deg."
             if moving > 0.5

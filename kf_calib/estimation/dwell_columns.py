@@ -16,7 +16,7 @@ from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
-from kf_calib.effects import Effect, FrameEffect, Stimulus
+from kf_calib.effects import Effect, RotationEffect, Stimulus
 from kf_calib.estimation.measurement_model import Model, effect_columns
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.temperature_course import temperature_course
@@ -255,7 +255,7 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
 
 def _rotations_of_effects(table: DwellTable, model: Model, state: Floats) -> Floats | None:
     """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where there are none."""
-    if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
+    if not model.bench.angles or not any(isinstance(effect, RotationEffect) for effect in model.effects):
         return None
     rotations, ends = model.turned_rad(stimulus_of(table, model.bench, state), state), 3 * table.folded.ends
     means = np.add.reduceat(rotations, ends[:-1], axis=0) / np.diff(ends)[:, None]

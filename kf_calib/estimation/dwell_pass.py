@@ -19,7 +19,7 @@ from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells import window_average
-from kf_calib.dwells.blocks import LARGEST, Block, Tally
+from kf_calib.dwells.blocks import LARGEST, Block, SampleCounts
 from kf_calib.dwells.folding import Folder, dwells_of_table, rows_of_table
 from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import SpectralLine
@@ -52,7 +52,7 @@ class Pass:
 
     source: Source
     settings: Settings
-    tally: Tally = field(default_factory=Tally)
+    counts: SampleCounts = field(default_factory=SampleCounts)
     folder: Folder = field(default_factory=Folder)
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
     tabulated: DwellTable | None = None
@@ -65,7 +65,7 @@ class Pass:
 
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
-        return segmenter_of(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
+        return segmenter_of(self.source.bench, self.settings.stillness, self.counts, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source; of a table, with every reading at its mean."""
@@ -77,7 +77,7 @@ class Pass:
         """Rows of the given blocks, averaged over windows if the settings or the model's effects require it."""
         usual_s = window_average.WINDOW_S if self.model.averages else 0.0
         window_s = 0.0 if self.model.oscillates else self.settings.window_s or usual_s
-        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
+        return model_rows(blocks, self.source.bench, self.counts, self.settings.gate_sigma, window_s)
 
     def add(self, rows: Rows) -> None:
         """Fold the rows of one block and record what they show."""
@@ -101,7 +101,7 @@ class Pass:
             table.refuse(" and ".join(map(str, self.model.effects)) or "an average over windows")
         self.tabulated = dwells_of_table(table.orientations, table.bench)
         read = int(table.orientations.counts.sum())
-        self.tally.read, self.tally.used, self.tally.poses = read, read, len(table.orientations)
+        self.counts.read, self.counts.used, self.counts.poses = read, read, len(table.orientations)
 
     @property
     def folded(self) -> DwellTable:
@@ -122,31 +122,31 @@ class Pass:
         return without_known(dwells, self.model)
 
 
-def refuse_unusable(dwells: DwellTable, tally: Tally, bench: Bench) -> None:
+def refuse_unusable(dwells: DwellTable, counts: SampleCounts, bench: Bench) -> None:
     """Raise InputError if there is nothing to calibrate from or if the readings are not in m/s^2, and BlunderError for
     a set-up that cannot be right."""
-    if not tally.read:
+    if not counts.read:
         raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
     if not bench.angles:
-        _refuse_restless(dwells, tally)
-    elif tally.poses_dropped and not tally.poses:
+        _refuse_restless(dwells, counts)
+    elif counts.poses_dropped and not counts.poses:
         raise InputError(
-            f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
+            f"none of the {counts.poses_dropped} angle messages can be used: they are not finite, beyond "
             f"{LARGEST:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
             "unit quaternions."
         )
-    elif not tally.poses:
+    elif not counts.poses:
         raise InputError(
             "the recording holds no platform angles (or attitude), so the direction of gravity is not known: "
             "record them on /platform/angles, at any rate."
         )
     elif not dwells:
-        turns = tally.farthest_rad / (2.0 * math.pi)
+        turns = counts.farthest_rad / (2.0 * math.pi)
         unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
         raise InputError(
-            f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
-            f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): "
-            + (tally.restless or "the platform must stand still; if it did, raise --still-deg or lower --settle-s")
+            f"no dwell was found in {counts.read} readings ({counts.moving} moving, {counts.settling} settling, "
+            f"{counts.not_finite} not finite, {counts.too_large} too large, {counts.without_pose} without an angle): "
+            + (counts.restless or "the platform must stand still; if it did, raise --still-deg or lower --settle-s")
             + f"{unit}."
         )
     means_mps2 = dwells.means[:, 4:]
@@ -167,14 +167,14 @@ def refuse_unusable(dwells: DwellTable, tally: Tally, bench: Bench) -> None:
     raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2).sentence}.")
 
 
-def _refuse_restless(dwells: DwellTable, tally: Tally) -> None:
+def _refuse_restless(dwells: DwellTable, counts: SampleCounts) -> None:
     """Raise InputError if no dwell shows in the readings themselves."""
     if not dwells:
         raise InputError(
-            f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
-            f"{tally.not_finite} not finite, {tally.too_large} too large): "
+            f"no dwell was found in {counts.read} readings ({counts.moving} moving, {counts.settling} settling, "
+            f"{counts.not_finite} not finite, {counts.too_large} too large): "
             + (
-                tally.restless
+                counts.restless
                 or "it never lay still: without angles it must, for at least a second and a half on each "
                 "side; if it did, raise --still-deg or lower --settle-s"
             )

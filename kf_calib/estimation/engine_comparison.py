@@ -178,8 +178,8 @@ def _remarks(settings: Settings, result: Calibration) -> list[str]:
             "the biases walk: the filters follow them (the block engine by what parabolas see of a path, some 0.001 "
             "sigma), batch least squares holds them still, so it may differ."
         )
-    if result.tally.gated:
-        said.append(f"the gate rejected {result.tally.gated} readings, the same ones for all three.")
+    if result.counts.gated:
+        said.append(f"the gate rejected {result.counts.gated} readings, the same ones for all three.")
     if not said:
         said.append("diffuse prior, no process noise, the same gate: the three may differ by rounding only.")
     return said

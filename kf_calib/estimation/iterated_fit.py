@@ -56,6 +56,7 @@ from kf_calib.noise.terms import (
 )
 from kf_calib.noise.within_dwells import within_dwells
 from kf_calib.support.searches import MOST_STEPS
+from kf_calib.support.text import listing
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -209,7 +210,7 @@ def _not_settled(model: Model) -> str:
             f"this run does not tell {effects} and the scale factors apart (the fit does not converge): leave out an "
             "effect, or visit more orientations."
         )
-    effects = " and ".join(map(str, model.effects))
+    effects = listing(map(str, model.effects))
     return (
         "the sizes of the readings at rest do not determine "
         + (f"{effects} beside the nine parameters: leave {effects} out" if effects else "the nine parameters")

@@ -18,7 +18,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import EXACT, Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
+from kf_calib.effects import Coefficient, Effect, RotationEffect, Stimulus, effect_named
 from kf_calib.effects.effect import KnownEffect
 from kf_calib.errors import InputError
 from kf_calib.support.text import printed
@@ -202,7 +202,7 @@ class Model:
         """Rotation vectors (m, 3) by which the effects at ``state`` (p,) turn the specific force."""
         rotation_rad = np.zeros((len(stimulus), 3))
         for effect in self.effects:
-            if isinstance(effect, FrameEffect) and effect.shows_in(stimulus):
+            if isinstance(effect, RotationEffect) and effect.shows_in(stimulus):
                 rotation_rad += effect.turned_rad(stimulus, state[self.parts[str(effect)]])
         return rotation_rad
 

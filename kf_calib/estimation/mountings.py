@@ -213,7 +213,7 @@ class AffineFit:
         """Tell whether all axes are near nominal."""
         return bool((np.diag(self.cosines) > FARTHEST).all())
 
-    def is_near(self) -> bool:
+    def is_near_nominal(self) -> bool:
         """Tell whether all axes and scale factors are near nominal."""
         return self.is_along() and bool((self.scales > GAIN_RANGE[0]).all() and (self.scales < GAIN_RANGE[1]).all())
 

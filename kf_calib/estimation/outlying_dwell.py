@@ -59,7 +59,7 @@ def wrong_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     dwells, estimate = result.fit.dwells, rest.estimate
     linearised = LinearisedDwells(without_attitudes(dwells), rest.model, estimate.state)
     means = linearised.means[[k]]
-    error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
+    error, covariance = means.readings[0] - means.design[0] @ estimate.state, _innovation_covariance(rest, means)
     statistic = min(float(error @ np.linalg.solve(covariance, error)), _fall(result, rest))
     p_value = min(len(dwells) * f_tail(3.0, max(rest.consistency.dof, 1), statistic / 3.0), 1.0)
     turns = tuple(_turns(linearised.dwells_at_state[k : k + 1], means, rest))
@@ -72,7 +72,7 @@ def _fall(result: Calibration, rest: Calibration) -> float:
     return max(with_all.statistic - rest.consistency.statistic, 0.0)
 
 
-def _covariance(rest: Calibration, means: Means) -> Floats:
+def _innovation_covariance(rest: Calibration, means: Means) -> Floats:
     """Return the covariance (3, 3) of one dwell's mean reading less its prediction."""
     design, estimate = means.design[0], rest.estimate
     own = mean_covariances(rest.noise, means, estimate.state)
@@ -95,7 +95,7 @@ def _turns(alone: DwellTable, means: Means, rest: Calibration) -> Iterator[Turn]
             design[:, i, 4 * i : 4 * i + 3] = force
         readings = means.readings + turning_mps2(alone, force - means.force_mps2, state, 1)
         there = replace(means, force_mps2=force, design=design, readings=readings)
-        return (readings - design @ state)[0], np.asarray(np.linalg.inv(_covariance(rest, there)), float)
+        return (readings - design @ state)[0], np.asarray(np.linalg.inv(_innovation_covariance(rest, there)), float)
 
     for gimbal, axis in enumerate(bench.to_metadata().get("axes", "").split()):
         (here, weight), (across, _), (opposite, _) = (at(gimbal, turn) for turn in (0.0, 0.5 * np.pi, np.pi))

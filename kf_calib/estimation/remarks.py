@@ -23,6 +23,7 @@ from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, d
 from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.noise.within_dwells import TOO_SHORT
+from kf_calib.support.text import listing
 from kf_calib.support.units import shown
 
 MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
@@ -67,7 +68,7 @@ def beyond_stated(noise: Noise, bench: Bench) -> bool:
 
 def _beyond_noise(noise: Noise) -> str:
     """Return what else than an effect may make the dwells scatter."""
-    keys = " and ".join(unstated(noise))
+    keys = listing(unstated(noise))
     if keys:
         return f"there is noise from dwell to dwell, which was not stated ({keys})"
     return "there is more noise from dwell to dwell than is stated (angle_sigma_deg, scatter_sigma_mps2)"
@@ -80,7 +81,7 @@ def remarks_on(
     model, dwells = linearised.model, linearised.dwells
     if model.dynamic and not linearised.slews:
         yield (
-            f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
+            f"{listing(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
             "readings and angles recorded all through the motions, angles at least every half second."
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
@@ -153,7 +154,7 @@ def remarks_on(
     elif model.bench.angles and unstated(noise) and degrees_of_freedom(linearised.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
-            f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
+            f"({listing(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
         )
     stated_deg = model.bench.angle_sigma_deg
     if stated_deg is not None and beyond_stated(noise, model.bench):
@@ -187,11 +188,9 @@ def _on_walks(walk: RandomWalk, intensity: Coefficient) -> str:
     """Return a remark on biases that walk by another amount each."""
     unit, walking = shown(intensity), np.flatnonzero(walk.spreads)
     sizes = [f"{unit.text(float(walk.sizes[k]), 2)} in accelerometer {k + 1}" for k in walking]
-    still = " and ".join(str(k + 1) for k in range(3) if k not in walking)
+    still = listing(str(k + 1) for k in range(3) if k not in walking)
     rest = f"; in accelerometer {still} no walk is seen" if still else ""
-    return (
-        f"the biases do not walk alike: by {' and '.join(sizes)}{rest}. {intensity.symbol} is their root mean square."
-    )
+    return f"the biases do not walk alike: by {listing(sizes)}{rest}. {intensity.symbol} is their root mean square."
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:

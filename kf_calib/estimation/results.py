@@ -14,7 +14,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.blocks import SampleCounts
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects.drift import WarmUp
@@ -173,7 +173,7 @@ class Calibration:
     estimate: Estimate
     consistency: Consistency
     residual_rms_mps2: float
-    tally: Tally
+    counts: SampleCounts
     warnings: tuple[str, ...]
     readings: Readings = field(default_factory=Readings)
     """Defects of the readings, found independently of the model."""

@@ -43,7 +43,7 @@ from kf_calib.estimation.mountings import (
 )
 from kf_calib.noise.reml import FEWEST
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.text import SHOWN
+from kf_calib.support.text import SHOWN, listing
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
@@ -62,18 +62,18 @@ def refuse(dwells: DwellTable, bench: Bench) -> None:
     means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
     _refuse_stuck(means, stated)
     affine, misfit = fit_affine(means, stated), float(Misfits.of_mounting(means, stated).of([CHANNELS])[0])
-    is_near = affine is None or affine.is_near()
+    is_near_nominal = affine is None or affine.is_near_nominal()
     if affine is not None and affine.left < NOISE and affine.is_along():
         _refuse_wrong_gain(means, affine, bench)
     if misfit > _CHANGE:  # else no change could explain more than it costs
         in_course = min(_one_dwell(means, stated), _exchange(means, stated))
-        least = min(misfit if is_near else math.inf, in_course[0])
+        least = min(misfit if is_near_nominal else math.inf, in_course[0])
         _refuse_mounting(means, stated, affine, least)
         if in_course[0] == least < math.inf:
             if in_course[1]:
                 raise BlunderError(in_course[1])
             return  # one dwell alone is off
-    if not is_near or (affine is None and determines_axes(means.readings / bench.gravity_mps2)):
+    if not is_near_nominal or (affine is None and determines_axes(means.readings / bench.gravity_mps2)):
         raise BlunderError(
             f"{_what_is_wrong(means, affine, bench)}, and no order or sign of channels, gimbals or angles brings all "
             "axes near nominal: check what the channels and the angles are, and state --nominal where the block is "
@@ -127,7 +127,7 @@ def _refuse_wrong_gain(means: DwellMeans, fitted: AffineFit, bench: Bench) -> No
         if scale < NOISE:
             _refuse_dead(means, bench, i)
         if not GAIN_RANGE[0] < scale < GAIN_RANGE[1]:
-            others = " and ".join(f"{other:.3g}" for other in np.delete(fitted.scales, i))
+            others = listing(f"{other:.3g}" for other in np.delete(fitted.scales, i))
             raise BlunderError(
                 f"channel {abs(bench.input.channels[i])} feels {scale:.3g} times gravity, the others {others}: check "
                 "its unit and its range; all channels must be in one unit."
@@ -204,7 +204,7 @@ def _channels(numbers: Sequence[int]) -> str:
 
 def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
     """Say what each of several equally good changes means, and which options state it."""
-    said = list(dict.fromkeys((" and ".join(_reasons(stated, each)), _advice(stated, each)) for each in mendings))
+    said = list(dict.fromkeys((listing(_reasons(stated, each)), _advice(stated, each)) for each in mendings))
     if len(said) == 1:
         reason, advice = said[0]
         return f"{reason}? Try {advice}."
@@ -227,7 +227,7 @@ def _reasons(stated: Bench, mending: Mending) -> list[str]:
     if len(negative) == 3:
         words.append("all readings have the opposite sign (acceleration in place of specific force)")
     elif negative:
-        words.append(f"channel {' and '.join(map(str, negative))} reversed")
+        words.append(f"channel {listing(map(str, negative))} reversed")
     return words
 
 
@@ -241,7 +241,7 @@ def _wired(stated: Bench, channels: Channels) -> str:
 def _advice(stated: Bench, mending: Mending) -> str:
     """Return the options that state a mounting and, where there is no option, what to do."""
     options = _options(stated, mending)
-    return " and ".join([*([" ".join(options)] if options else []), *_words(stated, mending)])
+    return listing([*([" ".join(options)] if options else []), *_words(stated, mending)])
 
 
 def _options(stated: Bench, mending: Mending) -> list[str]:
@@ -317,7 +317,7 @@ def _exchange(means: DwellMeans, stated: Mounting) -> tuple[float, str]:
         misfit = _misfit_within_noise(replace(means, readings=readings), stated)
         misfit += _CHANGE + math.log(count) + float(costs[first, 0] + costs[then, 0])
         if misfit < least:
-            parts = (" and ".join(_reasons(bench, Mending(stated, _WIRINGS[own]))) for own in (first, then))
+            parts = (listing(_reasons(bench, Mending(stated, _WIRINGS[own]))) for own in (first, then))
             one, other = (part or "channels are as stated" for part in parts)
             at = f"dwell {means.numbers[k + 1]} on (at {means.middle_s[k + 1]:.0f} s)"
             said = f"up to dwell {means.numbers[k]} {one}, from {at} {other}"

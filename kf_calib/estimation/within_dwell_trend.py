@@ -21,7 +21,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Mask
 from kf_calib.bench.paper_parameters import BIASES
-from kf_calib.dwells.pieces import basis_values, of_all_pieces
+from kf_calib.dwells.pieces import basis_coefficients, of_all_pieces
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import lines_of
@@ -158,7 +158,7 @@ def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | floa
     thermometer = noise.term(ThermometerError)
     if thermometer is None:
         return 0.0
-    of_errors = basis_values(thermometer.columns(linearised.dwells_at_state, linearised.state))
+    of_errors = basis_coefficients(thermometer.columns(linearised.dwells_at_state, linearised.state))
     squares, _ = _squares(linearised.dwells, _on_triangles(linearised.dwells, of_errors))
     return squares.reshape(len(squares), 3, -1, _DEGREE).sum(axis=2)
 

@@ -113,7 +113,7 @@ def verify(
     settings = replace(settings or Settings(), effects=())
     passed = Pass(source, settings)
     dwells = passed.fold(on_progress)
-    refuse_unusable(dwells, passed.tally, source.bench)
+    refuse_unusable(dwells, passed.counts, source.bench)
     with one_blas_thread():
         fitted = fit(dwells, Model(source.bench, model.effects))
         free = tuple(str(each) for each in model.effects if beyond_force_and_temperature(each, source.bench))
@@ -129,7 +129,7 @@ def verify(
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
         both >= MOVED_LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
-        (*source.warnings, *passed.tally.sentences(), *_warnings(saved, source, new)),
+        (*source.warnings, *passed.counts.sentences(), *_warnings(saved, source, new)),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Times
 from kf_calib.bench.streams import LAST_NS, SECOND_NS, Source, Table
-from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, SampleCounts
 from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.stationarity import Stillness
@@ -335,8 +335,8 @@ def noise_at_rest(
     if isinstance(source, Table):
         source.refuse("their noise")
     accel, thermometer = ChannelGroup(ACCELEROMETERS, "m/s^2"), ChannelGroup(THERMOMETER, "K")
-    tally, rests = Tally(), _Rests()
-    segmenter = RestSegmenter(source.bench, stillness or Stillness(), tally)
+    counts, rests = SampleCounts(), _Rests()
+    segmenter = RestSegmenter(source.bench, stillness or Stillness(), counts)
     latest = 0
     for block in _blocks(source, segmenter, thermometer if with_temperature else None):
         on_progress(source.fraction)
@@ -362,8 +362,9 @@ def noise_at_rest(
     channels = tuple(channel for group in groups for channel in group.noise())
     return RestNoise(
         channels, 1.0 / accel.period_s, accel.differences.count, len(accel.differences.lengths), accel.gaps,
-        accel.total_s, accel.longest_s, tally.moving, tally.settling,
-        tally.not_finite + tally.too_large + tally.repeated + tally.backward + tally.leaping, tuple(source.warnings),
+        accel.total_s, accel.longest_s, counts.moving, counts.settling,
+        counts.not_finite + counts.too_large + counts.repeated + counts.backward + counts.leaping,
+        tuple(source.warnings),
     )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Batch, Source
-from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.blocks import SampleCounts
 from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.sufficient_statistics import Dwell
@@ -31,6 +31,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
+from kf_calib.support.text import listing
 
 _FIRST_LOOK_S = 1.0
 
@@ -140,7 +141,7 @@ class Evaluation(ABC, Generic[J, S]):
             settings = replace(self.settings, effects=(*self.settings.effects, *names))
             self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
             self.settings = settings
-            self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
+            self._publish(notice=f"{listing(names)} accepted", model=self.settings.effects)
             if self._last is not None and not self._waiting:
                 self._waiting.append(self._last)
             self._lock.notify_all()
@@ -225,9 +226,9 @@ class Evaluation(ABC, Generic[J, S]):
         standing, folded = segmenter.standing, passed.folder.dwells
         closed = sum(1 for dwell in folded[self._closed :] if standing is None or dwell.number < standing)
         with self._lock:
-            self._publish(samples=passed.tally.read, elapsed_s=elapsed_s, **self._progress())
+            self._publish(samples=passed.counts.read, elapsed_s=elapsed_s, **self._progress())
         self._close_next(closed, elapsed_s)
-        self._look(standing, elapsed_s)
+        self._snapshot(standing, elapsed_s)
         with self._lock:
             self._taken += len(batch.accel)
             self._lock.notify_all()
@@ -239,7 +240,7 @@ class Evaluation(ABC, Generic[J, S]):
             passed.add(rows)
         self._close_next(len(passed.folder.dwells) - self._closed, self.standing.elapsed_s)
         with self._lock:
-            self._publish(samples=passed.tally.read, current=None)
+            self._publish(samples=passed.counts.read, current=None)
 
     def _close_next(self, count: int, elapsed_s: float) -> None:
         """Hand the next closed dwells to the judging thread, one by one; they do not change any more."""
@@ -247,7 +248,7 @@ class Evaluation(ABC, Generic[J, S]):
             self._closed += 1
             passed, folder = self._passed, Folder()
             folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
-            closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
+            closed = _Closed(replace(passed, counts=replace(passed.counts), folder=folder), elapsed_s)
             with self._lock:
                 self._last = closed
                 if not self.every:
@@ -258,7 +259,7 @@ class Evaluation(ABC, Generic[J, S]):
                 self._publish(dwells=self._closed, current=None)
                 self._lock.notify_all()
 
-    def _look(self, standing: int | None, elapsed_s: float) -> None:
+    def _snapshot(self, standing: int | None, elapsed_s: float) -> None:
         """Evaluate a copy of the open dwell when it has lasted 1, 2, 4 ... s."""
         if standing is None:
             return
@@ -267,7 +268,7 @@ class Evaluation(ABC, Generic[J, S]):
         arrival_s = self._segmenter.arrival_s
         if elapsed_s - arrival_s < max(2.0 * self._looked_s, _FIRST_LOOK_S):
             return
-        aside = replace(self._passed, tally=Tally(), folder=folder)
+        aside = replace(self._passed, counts=SampleCounts(), folder=folder)
         for rows in aside.rows_of(self._segmenter.waiting()):
             folder.add(rows)
         if not folder.dwells or folder.dwells[-1].count < FEWEST_READINGS:

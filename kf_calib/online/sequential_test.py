@@ -6,18 +6,18 @@ have no more than a single run. A test is one update of a factor and one project
 are computed again whenever the run has grown by a quarter. The cause of an alarm is found by ``diagnose``, from the
 same dwells.
 
-    watch = Watch.over(dwells, bench)
-    watch = watch.after(dwell)        # as each dwell closes
-    watch.alarmed, watch.p_value, watch.suspects
+    sequential = SequentialTest.over(dwells, bench)
+    sequential = sequential.after(dwell)        # as each dwell closes
+    sequential.alarmed, sequential.p_value, sequential.suspects
 
 The filter carries the columns of more effects than its model has. The estimate of the model is one small QR
 (``square_root_information.restrict``), and equals that of a filter without the other columns. So is the test of every
 effect that is carried but not in the model. A dwell that closes is one update of the square-root information factor.
 
-    running = Running.over(dwells, model, noise, state, candidates)
-    running = running.after(dwell)               # as each dwell closes
-    state, covariance, undetermined = running.solved()
-    running.scan.statistics                      # fall of chi-squared by each candidate
+    recursive = RecursiveTest.over(dwells, model, noise, state, candidates)
+    recursive = recursive.after(dwell)               # as each dwell closes
+    state, covariance, undetermined = recursive.solved()
+    recursive.scan.statistics                      # fall of chi-squared by each candidate
 
 The noise and the linearisation are those given. A constant inside the columns of an effect keeps its value, and
 effects that show in slews only are not supported. ``calibrate`` iterates or estimates all of these.
@@ -55,7 +55,7 @@ from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, sidak
 
 
 @dataclass(frozen=True)
-class Running:
+class RecursiveTest:
     """A filter after some dwells of a run; every change gives a new one.
 
     linearised: the dwells so far, with the columns of the model and of all candidates. inside: names of those effects
@@ -81,7 +81,7 @@ class Running:
         state: Floats,
         candidates: Iterable[Effect] = (),
         prior: Prior | None = None,
-    ) -> Running:
+    ) -> RecursiveTest:
         """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,).
 
         model: the effects to be estimated. noise: by which readings are weighted. candidates: further effects whose
@@ -113,7 +113,7 @@ class Running:
         known = {str(effect): effect for effect in self.linearised.model.effects}
         return Model(self.linearised.model.bench, tuple(known[name] for name in self.inside))
 
-    def after(self, dwell: Dwell | DwellTable, exact: bool = True, like: DwellTable | None = None) -> Running:
+    def after(self, dwell: Dwell | DwellTable, exact: bool = True, like: DwellTable | None = None) -> RecursiveTest:
         """The filter after one more dwell.
 
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
@@ -130,7 +130,7 @@ class Running:
         more = replace(self, linearised=linearised)
         return more._update(more._rows([-1])[0], steps(linearised.dwells, self.noise)[-1])
 
-    def lean(self) -> Running:
+    def lean(self) -> RecursiveTest:
         """The same filter without the columns of candidates in its dwells, which fill the memory in a long run. It can
         go on with ``exact=False`` only."""
         width = self.model.count
@@ -175,22 +175,22 @@ class Running:
         parts, count = self.linearised.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
-    def _update(self, rows: Floats, walked: Floats) -> Running:
+    def _update(self, rows: Floats, walked: Floats) -> RecursiveTest:
         """Return the filter after an update with whitened rows and the variances of a random walk before them."""
         factor, left = square_root_information.update(self.factor, rows, walked)
         return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
 
-    def _rebuild(self) -> Running:
+    def _rebuild(self) -> RecursiveTest:
         """Return the same filter with its factor built again from all dwells."""
         factor = square_root_information.start(self.prior, self.linearised.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
-        running = replace(self, factor=factor, left=0.0, rows=0)
+        recursive = replace(self, factor=factor, left=0.0, rows=0)
         for first in range(0, len(variances), _TOGETHER):
             part = range(first, min(first + _TOGETHER, len(variances)))
             for k, rows in zip(part, self._rows(part), strict=True):
-                running = running._update(rows, variances[k])
-        return running
+                recursive = recursive._update(rows, variances[k])
+        return recursive
 
     def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
@@ -202,21 +202,21 @@ class Running:
 _GROWN = 1.25
 _TOGETHER = 16  # dwells whose rows are whitened together: those of a long run would take much memory
 _FEWEST = 4
-"""Number of dwells with which a watch can begin: fewer cannot determine scale factors and misalignments."""
+"""Number of dwells with which a sequential test can begin: fewer cannot determine scale factors and misalignments."""
 
 
 @dataclass(frozen=True)
-class Watch:
+class SequentialTest:
     """The sequential test of a run; every dwell gives a new one.
 
-    running: filter that carries the columns of the candidates. fitted_at: number of dwells when noise and threshold
+    recursive: filter that carries the columns of the candidates. fitted_at: number of dwells when noise and threshold
     were computed. tests: effective number of independent tests among the candidates. looks: number of tests so far.
     alarmed: number of dwells after which the level was first crossed (None: never).
     """
 
     bench: Bench
     settings: Settings
-    running: Running
+    recursive: RecursiveTest
     fitted_at: int
     tests: float
     looks: int = 0
@@ -230,7 +230,7 @@ class Watch:
         settings: Settings | None = None,
         looks: int = 0,
         fitted: Fit | None = None,
-    ) -> Watch:
+    ) -> SequentialTest:
         """The sequential test after the first dwells, at least four, which count as one test.
 
         settings: of the calibration. looks: number of tests made before with another model. fitted: the model fitted to
@@ -238,11 +238,13 @@ class Watch:
         """
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
-            raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
+            raise ValueError(f"a sequential test begins with {_FEWEST} dwells, not {len(dwells)}")
         with one_blas_thread():
-            return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._look()
+            return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._tested()
 
-    def after(self, dwell: Dwell | DwellTable, fitted: Fit | None = None, dwells: DwellTable | None = None) -> Watch:
+    def after(
+        self, dwell: Dwell | DwellTable, fitted: Fit | None = None, dwells: DwellTable | None = None
+    ) -> SequentialTest:
         """The sequential test after one more dwell, or a table of it alone.
 
         fitted: the model fitted to all dwells, this one included, where it is known. dwells: all of them, where pieces
@@ -250,16 +252,18 @@ class Watch:
         """
         with one_blas_thread():
             like = None if fitted is None else fitted.dwells
-            running = self.running.after(dwell, exact=False, like=like).lean()  # built again when a quarter is added
-            if len(running.dwells) < _GROWN * self.fitted_at:
-                return replace(self, running=running)._look()
-            running, fitted_at, tests = _begun(dwells or running.dwells, self.bench, self.settings, fitted)
-            return replace(self, running=running, fitted_at=fitted_at, tests=tests)._look()
+            recursive = self.recursive.after(
+                dwell, exact=False, like=like
+            ).lean()  # built again when a quarter is added
+            if len(recursive.dwells) < _GROWN * self.fitted_at:
+                return replace(self, recursive=recursive)._tested()
+            recursive, fitted_at, tests = _begun(dwells or recursive.dwells, self.bench, self.settings, fitted)
+            return replace(self, recursive=recursive, fitted_at=fitted_at, tests=tests)._tested()
 
     @property
     def dwells(self) -> DwellTable:
         """The dwells so far."""
-        return self.running.dwells
+        return self.recursive.dwells
 
     @cached_property
     def p_value(self) -> float | None:
@@ -269,10 +273,10 @@ class Watch:
         """
         from scipy.special import chdtrc
 
-        statistic, dof = self.running.misfit
+        statistic, dof = self.recursive.misfit
         if dof <= 0:
             return None
-        scan = self.running.scan
+        scan = self.recursive.scan
         own = [float(chdtrc(c.dof, x)) for c, x in zip(scan.candidates, scan.statistics, strict=True) if c.dof]
         p_values = [float(chdtrc(dof, statistic)), *([sidak(min(own), self.tests)] if own else [])]
         going = self.trend
@@ -282,13 +286,13 @@ class Watch:
     @cached_property
     def trend(self) -> Trend | None:
         """The test of trends within dwells; None where spectral lines would give trends as well."""
-        going = trend_beside(self.running.linearised, self.running.noise, self.running.state)
+        going = trend_beside(self.recursive.linearised, self.recursive.noise, self.recursive.state)
         return unless_lines_make_it(going, self.dwells)
 
     @property
     def suspects(self) -> list[str]:
         """Names of the effects that are significant in the latest test, the one with the highest score first."""
-        scan = self.running.scan
+        scan = self.recursive.scan
         scores = {
             str(each.effect): float(delta_chi2) - critical_delta_chi2(each, self.tests)
             for each, delta_chi2 in zip(scan.candidates, scan.statistics, strict=True)
@@ -296,8 +300,8 @@ class Watch:
         }
         return sorted((name for name, score in scores.items() if score > 0), key=lambda name: -scores[name])
 
-    def _look(self) -> Watch:
-        """Return the watch after a test, at the level that is spent on it."""
+    def _tested(self) -> SequentialTest:
+        """Return the sequential test after a test, at the level that is spent on it."""
         if self.p_value is None:
             return self
         looks = self.looks + 1
@@ -308,15 +312,17 @@ class Watch:
         return looked
 
 
-def _begun(dwells: DwellTable, bench: Bench, settings: Settings, fitted: Fit | None) -> tuple[Running, int, float]:
+def _begun(
+    dwells: DwellTable, bench: Bench, settings: Settings, fitted: Fit | None
+) -> tuple[RecursiveTest, int, float]:
     """Return the filter with noise and linearisation from the dwells so far, their number, and the effective tests."""
     if fitted is None or fitted.linearised.slews or len(fitted.dwells) != len(dwells):
         fitted = fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
     noise = fitted.noise.for_goodness_of_fit.without(SlowWaves)
     noise = noise.with_terms(replace(noise.setting, considered=False))  # a test of the misfit allows for all of it
     model, state = fitted.linearised.model, fitted.linearised.state
-    running = Running.over(dwells, model, noise, state, _effects_to_watch(fitted)).lean()
-    return running, len(dwells), independent_tests(running.scan)
+    recursive = RecursiveTest.over(dwells, model, noise, state, _effects_to_watch(fitted)).lean()
+    return recursive, len(dwells), independent_tests(recursive.scan)
 
 
 def _effects_to_watch(fitted: Fit) -> list[Effect]:

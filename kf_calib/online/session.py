@@ -50,7 +50,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.evaluation import Evaluation, Progress
-from kf_calib.online.status import Current, Judgement, Standing, current, judge_so_far, judge_whole_run
+from kf_calib.online.status import CurrentDwell, Judgement, RunStatus, current, judge_so_far, judge_whole_run
 from kf_calib.online.suggestion import Itinerary, Suggestion, Visited, suggest
 
 
@@ -66,7 +66,7 @@ class _Fed:
         return iter(())
 
 
-class Session(Evaluation[Judgement, Standing]):
+class Session(Evaluation[Judgement, RunStatus]):
     """The evaluation of a bench as its readings come; see ``Evaluation``.
 
     auto: accept an effect that is missing once it has been told from all others.
@@ -113,8 +113,8 @@ class Session(Evaluation[Judgement, Standing]):
         with one_blas_thread():
             return suggest(itinerary, Visited(stays, min(judged, len(stays))), standing.judgement)
 
-    def _first_standing(self) -> Standing:
-        return Standing(model=self.settings.effects)
+    def _first_standing(self) -> RunStatus:
+        return RunStatus(model=self.settings.effects)
 
     def _refuse(self, model: Model, begun: bool = False) -> None:
         """Raise InputError where the model needs more than a source whose readings come once can give."""
@@ -134,14 +134,14 @@ class Session(Evaluation[Judgement, Standing]):
         return judge_so_far(passed, self.wanted, before)
 
     def _judged_whole(self, passed: Pass, before: Judgement | None, again: Source | None) -> Judgement:
-        return judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
+        return judge_whole_run(passed, self.wanted, None if before is None else before.sequential, again)
 
-    def _seen(self, dwell: Dwell) -> Current:
+    def _seen(self, dwell: Dwell) -> CurrentDwell:
         return current(dwell, self.standing.judgement)
 
     def _judged_next(self, judgement: Judgement) -> None:
         """With ``auto``, accept the missing effects once several judgements in a row were sure of them."""
-        if not (self.auto and judgement.alarm and judgement.look.settled):
+        if not (self.auto and judgement.alarm and judgement.snapshot.settled):
             return
         diagnosis = judgement.diagnosis
         if not diagnosis.sure:
@@ -280,7 +280,7 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
 
     def _judged(self, passed: Pass, before: HandJudgement | None) -> HandJudgement:
         dwells, settings, bench = passed.dwells, passed.settings, self.source.bench
-        refuse_unusable(dwells, passed.tally, bench)
+        refuse_unusable(dwells, passed.counts, bench)
         try:
             fitted = fit(dwells, passed.model, settings.walk_mps2_per_sqrt_s)
             result = with_remarks(evaluate_fit(fitted, settings), passed)

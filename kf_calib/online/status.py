@@ -1,8 +1,8 @@
 """Status of a run while it is recorded: sigmas, verdict, missing effects, next orientation and remaining time.
 
 A ``Judgement`` is made when a dwell closes, from the dwell factors so far, by the code that evaluates a recording. To
-keep the false-alarm probability of a single run, the model counts as consistent until the sequential test (``Watch``)
-raises its alarm. A ``Look`` tests all candidates; as it takes longer than all the rest, it is repeated only when its
+keep the false-alarm probability of a single run, the model counts as consistent until the ``SequentialTest`` raises its
+alarm. A ``CandidateSnapshot`` tests all candidates; as it takes longer than all the rest, it is repeated only when its
 result may have changed. The final judgement is that of ``diagnose``.
 """
 
@@ -17,7 +17,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.design.gimbal_limits import wrap
-from kf_calib.design.next_orientation import Advice, Course, course
+from kf_calib.design.next_orientation import Advice, SigmaForecast, forecast
 from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
@@ -31,7 +31,7 @@ from kf_calib.estimation.dwell_pass import Pass, fitted_to, refuse_unusable
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.online.evaluation import Progress
-from kf_calib.online.sequential_test import Watch
+from kf_calib.online.sequential_test import SequentialTest
 
 _DETERMINES = 1e-3  # share of its sigma to which a parameter comes down that was not determined at all
 _RISEN = 1.5  # times a sigma that the next dwell may take it up by before that is told
@@ -46,22 +46,22 @@ _FREEDOM = 9  # degrees of freedom that the model with the missing effects has t
 
 
 @dataclass(frozen=True)
-class Look:
+class CandidateSnapshot:
     """A test of all candidates against a run as it stood, with a diagnosis if the sequential test had raised its alarm.
 
-    result: the calibration then. watch: the sequential test then (None: too few dwells). diagnosed: the diagnosis
+    result: the calibration then. sequential: the sequential test then (None: too few dwells). diagnosed: the diagnosis
     (None: no alarm). agreed: number of looks in a row with the same result.
     """
 
     result: Calibration
-    watch: Watch | None
+    sequential: SequentialTest | None
     diagnosed: Diagnosis | None = None
     agreed: int = 1
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """The diagnosis, or without an alarm a statement that nothing is significant so far."""
-        return self.diagnosed or _not_judged(self.result, self.watch)
+        return self.diagnosed or _not_judged(self.result, self.sequential)
 
     @property
     def settled(self) -> bool:
@@ -72,21 +72,21 @@ class Look:
         after = None if self.diagnosed is None else self.diagnosed.after
         return self.agreed >= _AGREEING and (after is None or after.consistency.dof >= _FREEDOM)
 
-    def again(self, result: Calibration, watch: Watch | None) -> Look:
-        """The look at the run as it stands now: this one, unless its result may have changed."""
-        return _look(result, watch, self) if self._is_due(result, watch) else self
+    def again(self, result: Calibration, sequential: SequentialTest | None) -> CandidateSnapshot:
+        """The snapshot of the run as it stands now: this one, unless its result may have changed."""
+        return _snapshot(result, sequential, self) if self._is_due(result, sequential) else self
 
-    def _is_due(self, result: Calibration, watch: Watch | None) -> bool:
-        """Tell whether a new look is due: run, model or alarm has changed, or a diagnosis needs to be confirmed."""
+    def _is_due(self, result: Calibration, sequential: SequentialTest | None) -> bool:
+        """Tell whether a new one is due: run, model or alarm has changed, or a diagnosis needs to be confirmed."""
         before = self.result
         if len(result.visits) >= _GROWN * len(before.visits) or result.settings.effects != before.settings.effects:
             return True
-        if (watch is None) != (self.watch is None) or _alarmed(watch) != (self.diagnosed is not None):
+        if (sequential is None) != (self.sequential is None) or _alarmed(sequential) != (self.diagnosed is not None):
             return True
         return self.diagnosed is not None and (not self.settled or self._is_followed(result))
 
     def _is_followed(self, result: Calibration) -> bool:
-        """Tell whether the platform has visited the orientation that this look advised."""
+        """Tell whether the platform has visited the orientation that this snapshot advised."""
         going = self.diagnosis.next_orientation
         if going is None:
             return False
@@ -95,14 +95,16 @@ class Look:
         return bool((apart.max(axis=1) < np.radians(SAME_POSE_DEG)).any()) if len(poses) else False
 
 
-def _look(result: Calibration, watch: Watch | None, before: Look | None = None) -> Look:
-    """Return a look at the run; it counts agreement with the look before."""
-    if not _alarmed(watch):
-        return Look(result, watch)
+def _snapshot(
+    result: Calibration, sequential: SequentialTest | None, before: CandidateSnapshot | None = None
+) -> CandidateSnapshot:
+    """Return a snapshot of the run; it counts agreement with the one before."""
+    if not _alarmed(sequential):
+        return CandidateSnapshot(result, sequential)
     diagnosis = diagnose(result)
     diagnosed = before.diagnosed if before else None
     same = diagnosed is not None and _conclusion(diagnosis) == _conclusion(diagnosed)
-    return Look(result, watch, diagnosis, before.agreed + 1 if before and same else 1)
+    return CandidateSnapshot(result, sequential, diagnosis, before.agreed + 1 if before and same else 1)
 
 
 def _conclusion(diagnosis: Diagnosis) -> tuple[object, ...]:
@@ -111,26 +113,26 @@ def _conclusion(diagnosis: Diagnosis) -> tuple[object, ...]:
     return diagnosis.test.consistent, frozenset(diagnosis.missing), frozenset(diagnosis.ambiguity), enough
 
 
-def _alarmed(watch: Watch | None) -> bool:
+def _alarmed(sequential: SequentialTest | None) -> bool:
     """Tell whether the sequential test has raised its alarm."""
-    return watch is not None and watch.alarmed is not None
+    return sequential is not None and sequential.alarmed is not None
 
 
 @dataclass(frozen=True)
 class Judgement:
     """What is known of a run after a dwell.
 
-    result: the calibration. look: the latest test of all candidates, which may be a few dwells old. watch: the
-    sequential test (None: too few dwells). wanted (12,): target of each sigma, SI; NaN where there is none. course:
+    result: the calibration. snapshot: the latest test of all candidates, which may be a few dwells old. sequential: the
+    sequential test (None: too few dwells). wanted (12,): target of each sigma, SI; NaN where there is none. forecast:
     predicted sigmas if the run goes on (None: not determined yet). final: whether the run has ended.
     sigma_before (12,): the sigmas a dwell before (None: there were none).
     """
 
     result: Calibration
-    look: Look
-    watch: Watch | None
+    snapshot: CandidateSnapshot
+    sequential: SequentialTest | None
     wanted: Floats
-    course: Course | None = None
+    forecast: SigmaForecast | None = None
     final: bool = False
     sigma_before: Floats | None = None
 
@@ -149,27 +151,27 @@ class Judgement:
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """The diagnosis of the latest look, which may be of fewer dwells."""
-        return self.look.diagnosis
+        """The diagnosis of the latest snapshot, which may be of fewer dwells."""
+        return self.snapshot.diagnosis
 
     @property
     def alarm(self) -> bool:
         """Whether the sequential test, or after the end the whole run, rejects the model."""
-        return (self.final or _alarmed(self.watch)) and self.diagnosis.test.consistent is False
+        return (self.final or _alarmed(self.sequential)) and self.diagnosis.test.consistent is False
 
     @property
     def consistent(self) -> bool | None:
         """Whether the model agrees with the run; None while it is not judged."""
         if self.final:
             return self.diagnosis.consistent
-        return None if self.watch is None or self.watch.p_value is None else not self.alarm
+        return None if self.sequential is None or self.sequential.p_value is None else not self.alarm
 
     @property
     def p_value(self) -> float | None:
         """The p-value of the whole run where it is final, else of the latest sequential test; None if not judged."""
         if self.final:
             return self.diagnosis.test.p_value
-        return None if self.watch is None else self.watch.p_value
+        return None if self.sequential is None else self.sequential.p_value
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -195,10 +197,10 @@ class Judgement:
             seen, least = len(self.result.visits), _least(self.result)
             return (
                 f"too early to judge the model: {seen} of at least {least} orientations"
-                if self.watch is None and seen < least
+                if self.sequential is None and seen < least
                 else "too few measurements to judge the model"
             )
-        looks = f", look {self.watch.looks}" if self.watch is not None and not self.final else ""
+        looks = f", look {self.sequential.looks}" if self.sequential is not None and not self.final else ""
         if not self.alarm:
             return f"model consistent (p {format_p(self.p_value)}{looks})"
         dwell, channel, ratio = self.disagreeing
@@ -218,12 +220,12 @@ class Judgement:
         """
         if self.advice is not None:
             return self.advice[0].gimbal_deg, self.advice[1]
-        if self.course is None:
+        if self.forecast is None:
             return None
-        symbol, factor = self.course.next_reduction(self.worst)
+        symbol, factor = self.forecast.next_reduction(self.worst)
         if not factor > _DETERMINES:
-            return self.course.gimbal_deg, f"determines {symbol} for the first time"
-        return self.course.gimbal_deg, f"lowers sigma of {symbol} by {100.0 * (1.0 - factor):.0f} %"
+            return self.forecast.gimbal_deg, f"determines {symbol} for the first time"
+        return self.forecast.gimbal_deg, f"lowers sigma of {symbol} by {100.0 * (1.0 - factor):.0f} %"
 
     @cached_property
     def aims(self) -> Floats:
@@ -246,14 +248,14 @@ class Judgement:
 
         Infinite where it never will, NaN where it is not known.
         """
-        if self.course is None:
+        if self.forecast is None:
             return np.full(12, np.nan)
         sigma = self.result.estimate.sigma
-        return self.course.seconds_to(np.where(np.isfinite(self.wanted), self.wanted, sigma / 2.0), sigma)
+        return self.forecast.seconds_to(np.where(np.isfinite(self.wanted), self.wanted, sigma / 2.0), sigma)
 
 
 @dataclass(frozen=True)
-class Current:
+class CurrentDwell:
     """The open dwell.
 
     number: of the dwell, from 1. pose (k,): gimbal angles, rad. readings, seconds: number and duration of the readings
@@ -272,18 +274,18 @@ class Current:
 
 
 @dataclass(frozen=True)
-class Standing(Progress):
+class RunStatus(Progress):
     """What is known of a run on a bench at a moment; see ``Progress``.
 
     current: the open dwell. judgement: the latest judgement.
     """
 
-    current: Current | None = None
+    current: CurrentDwell | None = None
     judgement: Judgement | None = None
 
     @property
     def stayed_s(self) -> float:
-        """Duration of the readings of the open dwell by now, s: those of the latest look, and what came since."""
+        """Duration of the readings of the open dwell by now, s: those of the latest snapshot, and what came since."""
         return 0.0 if self.current is None else self.current.seconds + self.elapsed_s - self.looked_s
 
     @property
@@ -310,24 +312,26 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
     """
     dwells = passed.dwells
     with one_blas_thread():
-        refuse_unusable(dwells, passed.tally, passed.source.bench)
+        refuse_unusable(dwells, passed.counts, passed.source.bench)
         result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)
-        watch = _sequential_test(dwells, result, None if before is None else before.watch)
-        look = _look(result, watch) if before is None else before.look.again(result, watch)
+        sequential = _sequential_test(dwells, result, None if before is None else before.sequential)
+        snapshot = _snapshot(result, sequential) if before is None else before.snapshot.again(result, sequential)
         sigma_before = None if before is None else before.result.estimate.sigma
-        return Judgement(result, look, watch, wanted, _course(result, wanted), sigma_before=sigma_before)
+        return Judgement(result, snapshot, sequential, wanted, _forecast(result, wanted), sigma_before=sigma_before)
 
 
-def _sequential_test(dwells: DwellTable, result: Calibration, watch: Watch | None) -> Watch | None:
+def _sequential_test(
+    dwells: DwellTable, result: Calibration, sequential: SequentialTest | None
+) -> SequentialTest | None:
     """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
         return None
-    if watch is None or watch.settings.effects != settings.effects:
-        return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks, result.fit)
-    for k in range(len(watch.dwells), len(dwells)):
-        watch = watch.after(dwells[k : k + 1], result.fit, dwells[: k + 1])
-    return watch
+    if sequential is None or sequential.settings.effects != settings.effects:
+        return SequentialTest.over(dwells, bench, settings, 0 if sequential is None else sequential.looks, result.fit)
+    for k in range(len(sequential.dwells), len(dwells)):
+        sequential = sequential.after(dwells[k : k + 1], result.fit, dwells[: k + 1])
+    return sequential
 
 
 def _least(result: Calibration) -> int:
@@ -336,30 +340,32 @@ def _least(result: Calibration) -> int:
     return _FEWEST if stated else _FEWEST_UNSTATED
 
 
-def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
+def _not_judged(result: Calibration, sequential: SequentialTest | None) -> Diagnosis:
     """Return a diagnosis without an alarm: nothing is significant so far, and what the run could show."""
-    test = assess_candidates(result.fit, None if watch is None else watch.tests)
+    test = assess_candidates(result.fit, None if sequential is None else sequential.tests)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
-    if watch is None:
+    if sequential is None:
         said = "Too few orientations so far to judge the model by: visit more."
     return Diagnosis(before=result, test=test, verdict=said)
 
 
-def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
+def judge_whole_run(
+    passed: Pass, wanted: Floats, sequential: SequentialTest | None, again: Source | None = None
+) -> Judgement:
     """The final judgement: the calibration and the diagnosis of the whole run.
 
-    passed: the pass over all readings. wanted (12,): targets of the sigmas. watch: the sequential test so far. again:
-    the recording, to be read once more where that is needed.
+    passed: the pass over all readings. wanted (12,): targets of the sigmas. sequential: its test so far. again: the
+    recording, to be read once more where that is needed.
     """
     with one_blas_thread():
         result = conclude(passed, again)
-        look = Look(result, watch, diagnose(result, Refits(again)))
-        return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
+        snapshot = CandidateSnapshot(result, sequential, diagnose(result, Refits(again)))
+        return Judgement(result, snapshot, sequential, wanted, _forecast(result, wanted), final=True)
 
 
-def _course(result: Calibration, wanted: Floats) -> Course | None:
+def _forecast(result: Calibration, wanted: Floats) -> SigmaForecast | None:
     """Return the predicted sigmas if the run goes on, or None while nothing is determined."""
-    return None if result.estimate.unseen.all() else course(result.fit, _sizes(result, wanted))
+    return None if result.estimate.unseen.all() else forecast(result.fit, _sizes(result, wanted))
 
 
 def _sizes(result: Calibration, wanted: Floats) -> Floats:
@@ -369,13 +375,13 @@ def _sizes(result: Calibration, wanted: Floats) -> Floats:
     return np.array([result.bench.gravity_mps2 if unit == "m/s^2" else 1.0 for unit in paper_parameters.UNITS])
 
 
-def current(dwell: Dwell, judgement: Judgement | None) -> Current:
+def current(dwell: Dwell, judgement: Judgement | None) -> CurrentDwell:
     """The state of the open dwell, as far as it is folded.
 
     dwell: the open dwell. judgement: of the dwells before it (None: there is none yet, so that sigmas are NaN).
     """
     seconds, unknown = dwell.end_s - dwell.start_s, np.full(12, np.nan)
-    here = Current(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
+    here = CurrentDwell(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
         return here
     result, wanted = judgement.result, judgement.aims

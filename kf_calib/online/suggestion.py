@@ -21,11 +21,12 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, Reach, Timing, can_be_reached, order, wrap
-from kf_calib.design.next_orientation import Outlook, Pace, poses_within
+from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, GimbalLimits, Timing, can_be_reached, order, wrap
+from kf_calib.design.next_orientation import Outlook, SlewTimes, poses_within
 from kf_calib.errors import InputError
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.online.status import Judgement
+from kf_calib.support.text import listing
 
 Purpose = Literal["opening", "sharpen", "tell apart", "repeat", "return", "end"]
 Ended = Literal["", "targets", "named", "disagrees", "orientations", "budget"]
@@ -39,13 +40,13 @@ _BEYOND = 12  # orientations at most, after all targets are reached, to find out
 class Itinerary:
     """How a run is to be driven.
 
-    bench: with its limits. pace: of its gimbals. opening: number of orientations to begin with. most: number of
+    bench: with its limits. slew_times: of its gimbals. opening: number of orientations to begin with. most: number of
     orientations after which the run ends in any case. stay_s: of readings in each orientation where no target is set;
     longest_s: at most. ends_when_named: end when the missing effect is named, else go on to the targets.
     """
 
     bench: Bench
-    pace: Pace = field(default_factory=Pace)
+    slew_times: SlewTimes = field(default_factory=SlewTimes)
     opening: int = 12
     most: int = 60
     stay_s: float = 30.0
@@ -53,16 +54,16 @@ class Itinerary:
     ends_when_named: bool = True
 
     @cached_property
-    def reach(self) -> Reach:
+    def limits(self) -> GimbalLimits:
         """What the bench can take, by its description."""
-        return Reach.of(self.bench)
+        return GimbalLimits.of(self.bench)
 
     def getting_there_s(self, here: Floats, pose: Floats) -> float:
         """What going from one pose (k,) to another, rad, takes beside the readings that count, s.
 
         A stay that is to tell effects apart lasts no less: where white noise is left, half of the time is then used.
         """
-        return float(self.pace.slews_s(here, pose)) + self.pace.overhead_s
+        return float(self.slew_times.slews_s(here, pose)) + self.slew_times.overhead_s
 
     @cached_property
     def opening_poses(self) -> Floats:
@@ -71,7 +72,7 @@ class Itinerary:
         Each has the direction of gravity that is farthest from those before it, and all gimbals turn: what depends on
         angles that do not move gravity shows, too. Raises InputError where the limits leave none.
         """
-        poses = poses_within(self.reach)
+        poses = poses_within(self.limits)
         if not len(poses):
             raise InputError("no orientation is within the limits and outside the forbidden zones: widen them.")
         force = self.bench.specific_force(np.zeros(len(poses)), poses)
@@ -80,8 +81,8 @@ class Itinerary:
         while len(chosen) < min(self.opening, len(poses)):
             chosen.append(int(np.argmax(nearest)))
             nearest = np.minimum(nearest, np.arccos(np.clip(up @ up[chosen[-1]], -1.0, 1.0)))
-        timing = Timing(self.stay_s, PEAK_OVER_MEAN * self.pace.rate_degps, 0.3)
-        in_order = order(poses[chosen], force[chosen], timing, self.reach, np.zeros(poses.shape[1]))
+        timing = Timing(self.stay_s, PEAK_OVER_MEAN * self.slew_times.rate_degps, 0.3)
+        in_order = order(poses[chosen], force[chosen], timing, self.limits, np.zeros(poses.shape[1]))
         return poses[chosen][in_order]
 
 
@@ -150,15 +151,17 @@ def _outlook(itinerary: Itinerary, visited: Visited, judgement: Judgement) -> Ou
     if not np.isfinite(judgement.wanted).any():
         gravity = judgement.result.bench.gravity_mps2
         wanted = _UNREACHABLE * np.array([gravity if u == "m/s^2" else 1.0 for u in paper_parameters.UNITS])
-    return Outlook(judgement.result.fit, wanted, visited.pending or visited.stays[-1:], itinerary.reach, itinerary.pace)
+    return Outlook(
+        judgement.result.fit, wanted, visited.pending or visited.stays[-1:], itinerary.limits, itinerary.slew_times
+    )
 
 
 def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reached: bool) -> Suggestion | None:
     """Return the end of the run where it has come."""
     count = len(visited.stays)
-    is_settled = judgement.alarm and judgement.look.settled and judgement.diagnosis.sure
+    is_settled = judgement.alarm and judgement.snapshot.settled and judgement.diagnosis.sure
     if is_settled and itinerary.ends_when_named:
-        named = " and ".join(judgement.diagnosis.missing)
+        named = listing(judgement.diagnosis.missing)
         return Suggestion("end", f"the missing effect is named: {named}", ended="named")
     is_back = _same(visited.stays[0][0], visited.stays[-1][0])
     if is_reached and not judgement.alarm and count > itinerary.opening and is_back:
@@ -180,7 +183,7 @@ def _opening(itinerary: Itinerary, left: Floats, outlook: Outlook | None, judgem
     elif outlook is not None and judgement is not None and np.isfinite(judgement.result.noise.sigma_mps2).all():
         stay_s = outlook.share_s(left)
     here = None if outlook is None else outlook.pending[-1][0]
-    free = left if here is None else left[can_be_reached(itinerary.reach, here, left)]
+    free = left if here is None else left[can_be_reached(itinerary.limits, here, left)]
     pose = free[0] if len(free) else left[0]
     why = f"{len(left)} more to begin with: spread over the sphere, so that the model can be judged"
     return Suggestion("opening", why, _in_deg(pose), min(stay_s, itinerary.longest_s))
@@ -191,14 +194,14 @@ def _telling_apart(itinerary: Itinerary, visited: Visited, judgement: Judgement,
     diagnosis, usual_s = judgement.diagnosis, float(np.median([seconds for _, seconds in visited.stays]))
     here, pending = visited.stays[-1][0], visited.pending
     again = _to_repeat(visited, judgement) if diagnosis.noise or diagnosis.as_scatter else None
-    if again is not None and can_be_reached(itinerary.reach, here, again[None])[0]:
+    if again is not None and can_be_reached(itinerary.limits, here, again[None])[0]:
         why = "again where the model disagrees most: noise will not repeat, an effect will"
         return Suggestion("repeat", why, _in_deg(again), max(usual_s, itinerary.getting_there_s(here, again)))
     if judgement.advice is not None:
         advice, why = judgement.advice
         pose = np.radians(advice.gimbal_deg)
         is_new = not any(_same(pose, other) for other, _ in pending)
-        if is_new and can_be_reached(itinerary.reach, here, pose[None])[0]:
+        if is_new and can_be_reached(itinerary.limits, here, pose[None])[0]:
             stay_s = max(usual_s, itinerary.getting_there_s(here, pose), advice.stay_s or 0.0)
             return Suggestion("tell apart", why, _in_deg(pose), min(stay_s, itinerary.longest_s))
     further = _sharpening(itinerary, outlook, judgement)

@@ -292,12 +292,12 @@ def _source(positioner: str, source: str | None, keys: BenchKeys, record: Path |
 
 
 def _itinerary(bench: Bench, most: int, options: DriveOptions) -> Itinerary:
-    from kf_calib.design.next_orientation import Pace
+    from kf_calib.design.next_orientation import SlewTimes
     from kf_calib.online.suggestion import Itinerary
 
     stated = {"rate_degps": bench.rate_degps, "acceleration_degps2": bench.acceleration_degps2}
-    pace = Pace(**{name: value for name, value in stated.items() if value is not None})
-    return Itinerary(bench, pace, most=most, stay_s=options.stay_s, ends_when_named=not options.improve)
+    slew_times = SlewTimes(**{name: value for name, value in stated.items() if value is not None})
+    return Itinerary(bench, slew_times, most=most, stay_s=options.stay_s, ends_when_named=not options.improve)
 
 
 def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun) -> Drive:
@@ -310,7 +310,7 @@ def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun)
     session = running.session
     assert isinstance(session, Session)
     itinerary = _itinerary(running.source.bench, most, options)
-    rules = Rules(itinerary.reach, itinerary.pace, device.watch)
+    rules = Rules(itinerary.limits, itinerary.slew_times, device.watch)
     if isinstance(device.clock, SimulatedTime):
         device.clock.wait = session.wait_until_judged
     return Drive(device.positioner, session, itinerary, rules, device.clock, trouble=partial(_trouble, running),
@@ -382,15 +382,15 @@ def _show_dry_run(name: str, keys: BenchKeys, options: DriveOptions, as_json: bo
     poses, here = itinerary.opening_poses, np.zeros(len(bench.axes))
     ways, slews_s = list[list[Any]](), list[float]()
     for pose in poses:
-        way = route(itinerary.reach, here, pose)
+        way = route(itinerary.limits, here, pose)
         if way is None:
             begin, end = (angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
             raise InputError(
                 f"no way from {begin} to {end} keeps out of the forbidden zones: widen what the bench file allows."
             )
         stations = [here, *way]
-        slews_s.append(sum(float(itinerary.pace.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))
+        slews_s.append(sum(float(itinerary.slew_times.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))
         ways.append(way)
         here = pose
-    made = poses, ways, slews_s, options.stay_s, itinerary.pace.overhead_s
+    made = poses, ways, slews_s, options.stay_s, itinerary.slew_times.overhead_s
     print_result(as_json, views.dry_run_object, views.dry_run, *made)

@@ -204,7 +204,7 @@ class Drive:
         """Tell whether the table can have come here from where it was seen last."""
         if not self._here:
             return True
-        run_out_deg = self.rules.watch.late_factor * self.rules.pace.rate_degps * _REST_S
+        run_out_deg = self.rules.watch.late_factor * self.rules.slew_times.rate_degps * _REST_S
         return bool(np.abs(np.array(here) - np.array(self._here)).max() <= run_out_deg)
 
     @property

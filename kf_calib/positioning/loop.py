@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kf_calib.design.gimbal_limits import MARGIN_DEG, Reach, is_free, route, wrap
-from kf_calib.design.next_orientation import Pace
+from kf_calib.design.gimbal_limits import MARGIN_DEG, GimbalLimits, is_free, route, wrap
+from kf_calib.design.next_orientation import SlewTimes
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning.positioner import Watchfulness
 
@@ -91,13 +91,13 @@ class Seen:
 
 @dataclass(frozen=True)
 class Rules:
-    """Limits that hold for every command and every read-back: of the bench, of its pace, and of a motion.
+    """Limits that hold for every command and every read-back: of the bench, of its slew_times, and of a motion.
 
     until_s: when the time of the run is spent, and a stay ends in any case.
     """
 
-    reach: Reach
-    pace: Pace = field(default_factory=Pace)
+    limits: GimbalLimits
+    slew_times: SlewTimes = field(default_factory=SlewTimes)
     watch: Watchfulness = field(default_factory=Watchfulness)
     until_s: float = math.inf
 
@@ -167,7 +167,9 @@ def _harm(state: State, seen: Seen, rules: Rules) -> str:
     if left := _outside(seen.gimbal_deg, rules):
         return f"the platform is at {here}, {left}"
     if (leap_deg := _leap_deg(state, rules)) > 0.0:
-        return f"the read-back leaps: by {leap_deg:.0f} deg, faster than {rules.pace.rate_degps:g} deg/s can do it"
+        return (
+            f"the read-back leaps: by {leap_deg:.0f} deg, faster than {rules.slew_times.rate_degps:g} deg/s can do it"
+        )
     return ""
 
 
@@ -179,18 +181,18 @@ def is_impossible(state: State, seen: Seen, rules: Rules) -> bool:
 def _outside(gimbal_deg: Sequence[float], rules: Rules) -> str:
     """Return in which way a read-back is where it must not be, in words; empty where it may be there."""
     pose, margin = np.radians([gimbal_deg]), np.radians(MARGIN_DEG)
-    low, high = rules.reach.bounds.T
-    limited = [j for j in rules.reach.limits_deg if not low[j] - margin <= pose[0, j] <= high[j] + margin]
+    low, high = rules.limits.bounds.T
+    limited = [j for j in rules.limits.limits_deg if not low[j] - margin <= pose[0, j] <= high[j] + margin]
     if limited:
         return f"beyond the limits of gimbal {limited[0] + 1}"
-    inside = replace(rules.reach, limits_deg={}).allowed(wrap(pose))[0]
+    inside = replace(rules.limits, limits_deg={}).allowed(wrap(pose))[0]
     return "" if inside else "in a forbidden zone"
 
 
 def _moving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
-    """Watch a move until the platform stands at its target."""
+    """SequentialTest a move until the platform stands at its target."""
     watch, lasted_s, target = rules.watch, seen.now_s - state.since_s, _deg(state.target)
-    expected_s = float(rules.pace.slews_s(np.radians(state.start), np.radians(state.target)))
+    expected_s = float(rules.slew_times.slews_s(np.radians(state.start), np.radians(state.target)))
     here, off = np.array(seen.gimbal_deg), np.abs(np.array(seen.gimbal_deg) - np.array(state.target)).max()
     low, high = np.minimum(state.start, state.target), np.maximum(state.start, state.target)
     if (here < low - watch.off_path_deg).any() or (here > high + watch.off_path_deg).any():
@@ -234,7 +236,7 @@ def _first_moves(start_deg: Angles, rules: Rules) -> list[Angles]:
             there = here.copy()
             there[gimbal] += way_deg
             end = np.radians([there])
-            if rules.reach.allowed(end)[0] and is_free(rules.reach, np.radians(here), end)[0]:
+            if rules.limits.allowed(end)[0] and is_free(rules.limits, np.radians(here), end)[0]:
                 stations.append(tuple(there.round(6).tolist()))
                 here = there
                 break
@@ -281,7 +283,7 @@ def _choosing(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | 
     is_driven = rules.watch.silent_s < math.inf
     first = _first_moves(seen.gimbal_deg, rules) if state.number == 1 and is_driven else []
     begin_deg = first[-1] if first else seen.gimbal_deg
-    way = route(rules.reach, np.radians(begin_deg), np.radians(suggestion.gimbal_deg))
+    way = route(rules.limits, np.radians(begin_deg), np.radians(suggestion.gimbal_deg))
     if way is None:
         return _halted(state, f"no way to {_deg(suggestion.gimbal_deg)} keeps within the limits and out of the zones")
     stations = tuple(tuple(float(angle) for angle in np.degrees(station).round(6) + 0.0) for station in way)
@@ -294,7 +296,7 @@ def _to_next_station(state: State, seen: Seen, rules: Rules) -> tuple[State, Com
     """Go to the next station of the way, if that is allowed from where the platform is."""
     station, start = state.way[0], np.radians(seen.gimbal_deg)
     end = np.radians([station])
-    if not (rules.reach.allowed(end)[0] and is_free(rules.reach, start, end)[0]):
+    if not (rules.limits.allowed(end)[0] and is_free(rules.limits, start, end)[0]):
         return _halted(state, f"the way from {_deg(seen.gimbal_deg)} to {_deg(station)} is not allowed")
     state = replace(state, phase=Phase.MOVING, target=station, start=seen.gimbal_deg, way=state.way[1:])
     return replace(state, since_s=seen.now_s), Move(station)
@@ -320,7 +322,7 @@ def _leap_deg(state: State, rules: Rules) -> float:
         return 0.0
     (before_s, before), (now_s, now) = track
     moved = float(np.abs(np.array(now) - np.array(before)).max())
-    fastest = rules.watch.late_factor * rules.pace.rate_degps
+    fastest = rules.watch.late_factor * rules.slew_times.rate_degps
     at_most_s = now_s - before_s + state.held_up_s + rules.watch.latency_s
     return moved if moved > fastest * at_most_s + rules.watch.off_path_deg else 0.0
 

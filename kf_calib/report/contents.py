@@ -59,15 +59,18 @@ def facts(measured: Measured, result: Calibration) -> list[tuple[str, str]]:
 
 
 def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]:
-    bench, tally = result.bench, result.tally
+    bench, counts = result.bench, result.counts
     dwells = result.fit.dwells
     yield "Recording", measured.name
     yield "SHA-256", measured.sha256
     yield "Begun", measured.date
     for key, words in _NOTES.items():
         yield words, bench.notes.get(key, "")
-    used = tally.used - tally.gated
-    yield "Readings", f"{used} of {tally.read} used; {tally.moving} moving, {tally.settling} settling"
+    used = counts.used - counts.gated
+    yield (
+        "Readings",
+        f"{used} of {counts.read} used; {counts.moving} moving, {counts.settling} settling",
+    )
     last = dwells[-1].end_s
     yield "Dwells", f"{len(dwells)} in {len(orientations(dwells))} orientations, over {_duration(last)}"
     yield "Gimbals", _gimbals(result)

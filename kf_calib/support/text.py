@@ -72,6 +72,12 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
+def listing(words: Iterable[str]) -> str:
+    """Some words as ``a``, ``a and b`` or ``a, b and c``; "" of none."""
+    *first, last = [*words] or [""]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def shown_by(load: Callable[[], object]) -> None:
     """Have ``load`` called before the first result is shown: it imports the modules that register how."""
     _loaders.append(load)

@@ -218,10 +218,10 @@ def intervals_in_words(result: Calibration) -> list[Text]:
 
 def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:
     """The report that ``replay`` prints; diagnosed: whether a diagnosis is told after it."""
-    tally, dwells = result.tally, result.fit.dwells
+    counts, dwells = result.counts, result.fit.dwells
     head = (
-        f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in "
-        f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
+        f"{counts.used - counts.gated} of {counts.read} readings used, {len(dwells)} dwells in "
+        f"{len(orientations(dwells))} orientations ({counts.moving} readings moving, {counts.settling} settling)"
     )
     parts: list[RenderableType] = [
         head, *([] if result.bench.input.is_plain else [Text(f"Input: {result.bench.input}.")]),

@@ -21,7 +21,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
     judged, noise, dwells = result.consistency, result.noise, result.fit.dwells
     return clean(
         {
-            "samples": result.tally.read,
+            "samples": result.counts.read,
             "dwells": len(dwells),
             "orientations": len(orientations(dwells)),
             "engine": result.settings.engine,
@@ -44,7 +44,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 **members(judged, "p_value", "nis_per_dof", "dof"),
             },
             **members(result, "residual_rms_mps2", "held_out_rms_mps2", "held_out_floor_mps2"),
-            "counts": {key: value for key, value in vars(result.tally).items() if isinstance(value, int)},
+            "counts": {key: value for key, value in vars(result.counts).items() if isinstance(value, int)},
             "readings": readings_object(result.readings),
             "outlying_dwells": [outlying_object(each) for each in result.outlying],
             "warnings": list(result.warnings),

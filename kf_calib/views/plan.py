@@ -32,9 +32,9 @@ def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
 
     beside_paper: add the figures of the paper's set of orientations.
     """
-    symbols, before = plan.prospect.symbols, plan.prospect.last is not None
+    symbols, before = plan.information.symbols, plan.information.last is not None
     document = {
-        "axes": plan.prospect.model.bench.to_metadata()["axes"],
+        "axes": plan.information.model.bench.to_metadata()["axes"],
         "count": len(plan.poses),
         "gimbal_deg": plan.gimbal_deg,
         "up": None,
@@ -53,7 +53,7 @@ def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
         "remarks": plan.remarks,
     }
     if beside_paper:
-        theirs, twelve = papers_sigma(plan.prospect), paper_parameters.SYMBOLS
+        theirs, twelve = papers_sigma(plan.information), paper_parameters.SYMBOLS
         document["paper"] = {
             "sigma": _by_symbol(twelve, theirs),
             "mean_error_percent": _by_symbol(twelve, mean_error_percent(theirs)),
@@ -91,7 +91,7 @@ def _orientations(made: Plan) -> ConsoleTable:
         (str(k), f"{begin:.0f}", *(f"{angle:.2f}" for angle in angles), " ".join(f"{part:+.3f}" for part in up))
         for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1)
     ]
-    gimbals = [f">{name.replace('_', ' ')}, deg" for name in gimbal_names(made.prospect.model.bench)]
+    gimbals = [f">{name.replace('_', ' ')}, deg" for name in gimbal_names(made.information.model.bench)]
     title = f"{counted(len(made.poses), 'orientation')}, in this order"
     return table(title, (">", ">begins, s", *gimbals, ">up, in the platform"), rows)
 
@@ -99,10 +99,10 @@ def _orientations(made: Plan) -> ConsoleTable:
 def _sigmas(made: Plan, beside_paper: bool) -> ConsoleTable:
     """Return the table of the predicted sigmas."""
     columns = _columns(made, beside_paper)
-    units = [*map(shown, paper_parameters.UNITS), *map(shown, made.prospect.model.coefficients)]
+    units = [*map(shown, paper_parameters.UNITS), *map(shown, made.information.model.coefficients)]
     rows = [
         (symbol(name), *(_figure(values[k], percent, unit) for values, percent in columns.values()), unit.label)
-        for k, (name, unit) in enumerate(zip(made.prospect.symbols, units, strict=True))
+        for k, (name, unit) in enumerate(zip(made.information.symbols, units, strict=True))
     ]
     headings = "parameter", *(f">{name}" for name in columns), "unit"
     return table("Predicted sigma (1σ)", headings, rows, FOURS)
@@ -111,13 +111,13 @@ def _sigmas(made: Plan, beside_paper: bool) -> ConsoleTable:
 def _columns(plan: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
     """Return for each heading of that table the values (p,) and whether they are in per cent."""
     columns = dict[str, tuple[Floats, bool]]()
-    if plan.prospect.last is not None:
+    if plan.information.last is not None:
         columns["now"] = plan.sigma[0], False
     columns["this plan"] = plan.sigma[-1], False
     if plan.balanced_sigma is not None:
         columns["balanced"] = plan.balanced_sigma, False
     if beside_paper:
-        theirs, none = papers_sigma(plan.prospect), np.full(len(plan.prospect.symbols) - STATE_COUNT, np.nan)
+        theirs, none = papers_sigma(plan.information), np.full(len(plan.information.symbols) - STATE_COUNT, np.nan)
         columns["paper's set"] = np.append(theirs, none), False
         columns["as in Table 2: plan"] = np.append(mean_error_percent(plan.sigma[-1, :STATE_COUNT]), none), True
         columns["paper"] = np.append(mean_error_percent(theirs), none), True
@@ -133,14 +133,15 @@ def _figure(value: float, percent: bool, unit: Unit) -> str:
 
 def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
     """The quality of the plan in sentences."""
-    count = len(made.prospect.symbols)
+    count = len(made.information.symbols)
     told = [
         f"Aim {made.search.aim.name}: {made.search.aim.measures} {made.cost:.4g}. Condition number "
         f"{made.condition_number:.4g} (rad, 1, g; the least is √3).",
         f"D-efficiency {made.d_efficiency:.4f} of the bound; {made.d_efficiency_within_reach:.4f} of what these "
         f"gimbals can. Largest variance function {made.largest_variance:.4g} ({count} where D-optimal).",
         f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews."
-        + f" Correlation of time with the direction of gravity: {made.correlation:.2f}." * (made.prospect.last is None),
+        + f" Correlation of time with the direction of gravity: {made.correlation:.2f}."
+        * (made.information.last is None),
     ]
     if beside_paper:
         told.append(
@@ -152,7 +153,7 @@ def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
 
 def write_csv(made: Plan, path: Path) -> None:
     """Write a CSV file with the names of the gimbals, then one line of angles in deg for each dwell."""
-    header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made.prospect.model.bench))
+    header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made.information.model.bench))
     rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
     write_whole(path, ("\n".join([header, *rows]) + "\n").encode())
 

@@ -10,18 +10,18 @@ from kf_calib.design.next_orientation import (
     ENOUGH,
     STAYS_S,
     Advice,
-    Course,
+    SigmaForecast,
     _poses,
     _separations,
-    course,
     factor_of,
+    forecast,
     root_after,
     sigmas_after,
     sigmas_of,
     to_show,
     to_tell_apart,
 )
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.results import Calibration
@@ -150,10 +150,10 @@ def test_sigmas_after_a_dwell_are_those_of_the_information_with_its_rows(unknown
 def test_a_course_goes_where_the_sum_of_squares_is_least() -> None:
     """Of sigmas in units of the targets, against an inversion of the information at each pose."""
     fitted, sizes = run(plan=PLAN[:6]).fit, np.geomspace(1e-7, 1e-5, 12)
-    found, poses, factor = course(fitted, sizes), _poses(fitted), factor_of(fitted)
+    found, poses, factor = forecast(fitted, sizes), _poses(fitted), factor_of(fitted)
     assert found is not None and poses is not None
     rows, jacobian = (
-        Prospect.following(fitted).columns([], poses),
+        PredictedInformation.following(fitted).columns([], poses),
         paper_parameters.jacobian(fitted.linearised.state[:12]),
     )
     covariances = np.linalg.inv(factor.T @ factor + np.swapaxes(rows, 1, 2) @ rows)
@@ -165,7 +165,7 @@ def test_a_course_goes_where_the_sum_of_squares_is_least() -> None:
 
 def test_time_that_is_left_is_counted_in_dwells_and_then_by_the_root_of_their_number() -> None:
     sigma = np.array([4.0, 3.0, 2.0])[:, None] * np.ones(12)
-    ahead = Course((0.0,), sigma, dwells=6, each_s=10.0)
+    ahead = SigmaForecast((0.0,), sigma, dwells=6, each_s=10.0)
     wanted, now = np.array([5.0, 3.5, 2.0, 1.0] * 3), np.array([4.0, 4.0, np.nan, 4.0] * 3)
     assert ahead.seconds_to(wanted, now).tolist() == [0.0, 10.0, 20.0, 260.0] * 3  # (6 + 2) (2 / 1)^2 - 6 dwells
 

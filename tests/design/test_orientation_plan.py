@@ -16,9 +16,9 @@ from kf_calib.bench.keys import ranges
 from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gimbal_limits import Reach, Timing, middles_s, order, slews_s, time_correlation
+from kf_calib.design.gimbal_limits import GimbalLimits, Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.design.orientation_plan import fewest, papers_sigma, plan
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate
@@ -32,17 +32,17 @@ BIASES = [k for k, unit in enumerate(paper_parameters.UNITS) if unit == "m/s^2"]
 TABLE_2_OPTIMAL = [0.7152, 0.6555, 1.1370, 12.0713, 0.6982, 0.6816, 1.2563, 10.7666, 0.7201, 0.6652, 1.0919, 11.4856]
 
 
-def prospect(**keys: float) -> Prospect:
-    return Prospect.of_bench(Bench(axes_of("yzx"), G, **keys), SIGMA, READINGS, 30.0)
+def information(**keys: float) -> PredictedInformation:
+    return PredictedInformation.of_bench(Bench(axes_of("yzx"), G, **keys), SIGMA, READINGS, 30.0)
 
 
 def search(
-    reach: Reach | None = None,
+    limits: GimbalLimits | None = None,
     aim: optimality_criteria.Aim = optimality_criteria.D,
     scheme: Scheme | None = None,
     **keys: float,
 ) -> Search:
-    return Search(prospect(**keys), reach or Reach(BENCH), aim, scheme or Scheme())
+    return Search(information(**keys), limits or GimbalLimits(BENCH), aim, scheme or Scheme())
 
 
 def up(poses: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_five_orientations_cannot_be_balanced_and_the_efficiency_says_so() -> No
 @pytest.mark.parametrize("name", ["A", "E", "minimax", "condition"])
 def test_every_criterion_has_the_balanced_set_for_its_optimum(name: str) -> None:
     made = plan(search(aim=optimality_criteria.NAMED[name]), 6, TIMING)
-    balanced = optimality_criteria.NAMED[name](triangle(made.prospect.balanced(6).reshape(-1, 12)))
+    balanced = optimality_criteria.NAMED[name](triangle(made.information.balanced(6).reshape(-1, 12)))
     assert made.cost == pytest.approx(math.exp(float(balanced)), rel=5e-3)
 
 
@@ -92,7 +92,7 @@ def test_four_orientations_for_three_accelerometers_beat_the_papers_sets() -> No
     deviations = np.array([{"rad": math.radians(30 / 3600)}.get(unit, 5e-5) for unit in paper_parameters.UNITS])
     percent = 100 * math.sqrt(2 / math.pi) * made.sigma[-1] / deviations
     assert (percent < TABLE_2_OPTIMAL)[ANGLES + BIASES].all()
-    theirs = papers_sigma(made.prospect)
+    theirs = papers_sigma(made.information)
     for places, closed in (
         (ANGLES, SIGMA * math.sqrt(1 / 100 + 1 / 200) / G),
         (SCALES, SIGMA / math.sqrt(200) / G),
@@ -105,8 +105,8 @@ def test_four_orientations_for_three_accelerometers_beat_the_papers_sets() -> No
 
 @pytest.mark.parametrize("name", ["D", "A", "minimax"])
 def test_exchange_finds_what_brute_force_finds_on_a_small_grid(name: str) -> None:
-    reach = Reach(BENCH, {1: (-60.0, 60.0), 2: (-45.0, 90.0)}, grid_deg=45.0)
-    tried = search(reach, optimality_criteria.NAMED[name])
+    limits = GimbalLimits(BENCH, {1: (-60.0, 60.0), 2: (-45.0, 90.0)}, grid_deg=45.0)
+    tried = search(limits, optimality_criteria.NAMED[name])
     rows = tried.candidate_rows
     every = np.array(list(itertools.combinations_with_replacement(range(len(rows)), 5)))
     stacked = rows[every].reshape(len(every), -1, 12)
@@ -116,7 +116,7 @@ def test_exchange_finds_what_brute_force_finds_on_a_small_grid(name: str) -> Non
 
 @pytest.mark.slow
 def test_the_bound_of_limited_gimbals_is_above_all_designs_and_near_the_best() -> None:
-    limited = search(Reach(BENCH, {1: (-60.0, 60.0), 2: (-60.0, 60.0)}))
+    limited = search(GimbalLimits(BENCH, {1: (-60.0, 60.0), 2: (-60.0, 60.0)}))
     rng = np.random.default_rng(1)
     made = plan(limited, 12, TIMING)
     assert 0.98 < made.d_efficiency_within_reach <= 1.0 and made.d_efficiency < 0.9
@@ -129,8 +129,8 @@ def test_the_bound_of_limited_gimbals_is_above_all_designs_and_near_the_best() -
 
 def test_limits_zones_grids_and_lists_are_kept() -> None:
     zone = {1: (-40.0, 10.0), 2: (20.0, 80.0)}
-    reach = Reach(BENCH, {1: (-80.0, 110.0), 2: (-100.0, 100.0)}, [zone])
-    for chosen in (reach, Reach(BENCH, reach.limits_deg, [zone], grid_deg=20.0)):
+    limits = GimbalLimits(BENCH, {1: (-80.0, 110.0), 2: (-100.0, 100.0)}, [zone])
+    for chosen in (limits, GimbalLimits(BENCH, limits.limits_deg, [zone], grid_deg=20.0)):
         made = plan(search(chosen), 10, TIMING)
         z, x = made.gimbal_deg[:, 1:].T
         assert z.min() >= -80 and z.max() <= 110 and x.min() >= -100 and x.max() <= 100
@@ -139,19 +139,19 @@ def test_limits_zones_grids_and_lists_are_kept() -> None:
         assert through == any("forbidden zone" in remark for remark in made.remarks)
     np.testing.assert_allclose(made.gimbal_deg % 20.0, 0.0, atol=1e-9)
     listed = np.random.default_rng(0).uniform(-180, 180, (9, 3)).round(3)
-    made = plan(search(Reach(BENCH, positions_deg=listed.tolist())), 8, TIMING)
+    made = plan(search(GimbalLimits(BENCH, positions_deg=listed.tolist())), 8, TIMING)
     assert all((np.abs(listed - row).max(axis=1) < 1e-9).any() for row in made.gimbal_deg)
 
 
 def test_ways_through_a_zone_are_seen_by_walking_them() -> None:
     rng = np.random.default_rng(4)
-    reach = Reach(BENCH, {}, [{1: (20.0, 50.0), 2: (-30.0, 30.0)}])
+    limits = GimbalLimits(BENCH, {}, [{1: (20.0, 50.0), 2: (-30.0, 30.0)}])
     ends = rng.uniform(-np.pi, np.pi, (2, 200, 3))
     share = np.linspace(0, 1, 2001)[:, None, None]
     walked = ends[0] + share * (ends[1] - ends[0])
-    hit = ~reach.allowed(walked.reshape(-1, 3)).reshape(2001, 200).all(axis=0)
+    hit = ~limits.allowed(walked.reshape(-1, 3)).reshape(2001, 200).all(axis=0)
     assert hit.sum() > 10
-    np.testing.assert_array_equal(reach.crosses(*ends), hit)
+    np.testing.assert_array_equal(limits.crosses(*ends), hit)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_ways_through_a_zone_are_seen_by_walking_them() -> None:
 )
 def test_limits_that_leave_the_set_singular_name_what_is_unseen(limits: dict, lost: set[str]) -> None:
     with pytest.raises(UnobservableError) as raised:
-        plan(search(Reach(BENCH, limits)), 12, TIMING)
+        plan(search(GimbalLimits(BENCH, limits)), 12, TIMING)
     assert set(str(raised.value).split("determines ")[1].split(":")[0].split(", ")) == lost
     with pytest.raises(UnobservableError, match="3 dwells leave"):
         plan(search(), 3, TIMING)
@@ -184,7 +184,9 @@ def test_setting_errors_count_as_the_noise_model_says() -> None:
 def test_the_order_keeps_slews_short_and_time_apart_from_gravity() -> None:
     poses = plan(search(), 24, TIMING).poses
     forces = BENCH.specific_force(np.zeros(24), poses)
-    loose, tight = (poses[order(poses, forces, Timing(30.0, 20.0, limit), Reach(BENCH), None)] for limit in (1.0, 0.05))
+    loose, tight = (
+        poses[order(poses, forces, Timing(30.0, 20.0, limit), GimbalLimits(BENCH), None)] for limit in (1.0, 0.05)
+    )
     spent = [slews_s(each[1:], each[:-1], 20.0).sum() for each in (loose, tight)]
     rng = np.random.default_rng(0)
     usual = [slews_s(own[1:], own[:-1], 20.0).sum() for own in (rng.permutation(poses) for _ in range(200))]
@@ -199,16 +201,16 @@ def test_the_order_keeps_slews_short_and_time_apart_from_gravity() -> None:
 
 def test_repeats_and_antipodes() -> None:
     for limits in ({}, {1: (-100.0, 100.0)}):
-        reach = Reach(BENCH, limits)
-        scheme = Scheme.of(reach, 2, True)
-        made = plan(search(reach, scheme=scheme), 16, TIMING)
+        limits = GimbalLimits(BENCH, limits)
+        scheme = Scheme.of(limits, 2, True)
+        made = plan(search(limits, scheme=scheme), 16, TIMING)
         directions = made.directions
-        assert made.d_efficiency > 0.999 and reach.allowed(made.poses).all()
+        assert made.d_efficiency > 0.999 and limits.allowed(made.poses).all()
         for own in directions:
             assert (directions @ own < -1 + 1e-6).sum() == 2 and (directions @ own > 1 - 1e-6).sum() == 2
         assert np.abs(np.diff(made.poses, axis=0)).max(axis=1).min() > 0  # it leaves what it comes back to
     with pytest.raises(InputError, match="multiple of 4"):
-        plan(search(reach, scheme=scheme), 10, TIMING)
+        plan(search(limits, scheme=scheme), 10, TIMING)
 
 
 def test_fewest_dwells_by_the_closed_form() -> None:
@@ -256,10 +258,10 @@ def eight():
 
 @pytest.mark.slow
 def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
-    ahead = Prospect.after(eight.fit)
+    ahead = PredictedInformation.after(eight.fit)
     np.testing.assert_allclose(optimality_criteria.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)
-    looking = Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"])
-    made = plan(Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"]), 1, TIMING)
+    looking = Search(ahead, GimbalLimits(eight.bench), optimality_criteria.NAMED["A"])
+    made = plan(Search(ahead, GimbalLimits(eight.bench), optimality_criteria.NAMED["A"]), 1, TIMING)
     cost = looking.measure(made.poses)
     grid = np.radians(np.random.default_rng(0).uniform(-180, 180, (2000, 3)))
     assert cost <= min(looking.measure(pose[None]) for pose in grid) + 1e-3
@@ -272,7 +274,9 @@ def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
 
 def test_predicted_sigma_after_the_next_dwell_is_what_the_filter_then_has(eight) -> None:
     """The same recording with one more dwell, there."""
-    made = plan(Search(Prospect.after(eight.fit), Reach(eight.bench), optimality_criteria.D), 1, TIMING)
+    made = plan(
+        Search(PredictedInformation.after(eight.fit), GimbalLimits(eight.bench), optimality_criteria.D), 1, TIMING
+    )
     poses = np.vstack([np.random.default_rng(5).uniform(-0.6, 0.6, (8, 3)), made.poses])
     after = calibrate(Run(seed=4, dwells=9, poses=poses))
     np.testing.assert_allclose(made.sigma[-1], after.estimate.sigma, rtol=0.03)

@@ -11,7 +11,7 @@ from kf_calib.estimation.settings import Settings
 
 
 def test_nothing_is_rejected_from_clean_noise() -> None:
-    assert calibrate(Run(seed=1, dwells=6, count=20_000)).tally.gated == 0
+    assert calibrate(Run(seed=1, dwells=6, count=20_000)).counts.gated == 0
 
 
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.2])
@@ -23,7 +23,7 @@ def test_outliers_are_rejected_counted_and_harmless(share: float) -> None:
     one, other = calibrate(clean), calibrate(dirty)
     place = np.arange(len(hit)) % 300  # within the dwell: a second settles, the last angle message of a dwell ends it
     evaluated = ((place >= 20) | (np.arange(len(hit)) < 300)) & (place < 288)
-    assert other.tally.gated == pytest.approx((hit & evaluated).sum(), rel=0.03, abs=1)
+    assert other.counts.gated == pytest.approx((hit & evaluated).sum(), rel=0.03, abs=1)
     assert any("outlying readings" in warning for warning in other.warnings)
     shift = np.abs(other.estimate.parameters - one.estimate.parameters) / one.estimate.sigma
     assert shift.max() < 2.5
@@ -40,7 +40,7 @@ def test_an_orientation_that_disagrees_is_kept_as_evidence() -> None:
     run = Run(seed=3)
     run.accel.values[3 * 300 : 4 * 300] += 0.01  # a hundred sigma, the whole fourth dwell
     result = calibrate(run)
-    assert result.tally.gated == 0
+    assert result.counts.gated == 0
     assert result.consistency.consistent is False
 
 

@@ -14,13 +14,13 @@ from scipy import stats
 import kf_calib
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.dwells.blocks import Block, Tally
+from kf_calib.dwells.blocks import Block, SampleCounts
 from kf_calib.dwells.rest_in_readings import RestSegmenter, _chi_squared
 
 BENCH = Bench((), 9.81, angles=False)
 
 
-def found(accel: Stream, warm: Stream, cuts: np.ndarray) -> tuple[list[Block], Tally, int]:
+def found(accel: Stream, warm: Stream, cuts: np.ndarray) -> tuple[list[Block], SampleCounts, int]:
     """Blocks, counts, and the most readings that waited, of readings cut before these places."""
     segmenter, out, most = RestSegmenter(BENCH), list[Block](), 0
     edges = [0, *cuts.tolist(), len(accel)]
@@ -30,7 +30,7 @@ def found(accel: Stream, warm: Stream, cuts: np.ndarray) -> tuple[list[Block], T
         until = len(warm) if end == len(accel) else int(around[1])
         out += segmenter.push(Batch(part, Stream.empty(4), warm[int(around[0]) : until]))
         most = max(most, len(segmenter._accel))
-    return [*out, *segmenter.finish()], segmenter.tally, most
+    return [*out, *segmenter.finish()], segmenter.counts, most
 
 
 @cache
@@ -43,17 +43,17 @@ def streams() -> tuple[Stream, Stream]:
 @pytest.mark.slow
 def test_blocks_are_the_same_to_the_bit_however_the_readings_are_cut() -> None:
     accel, warm = streams()
-    whole, tally, _ = found(accel, warm, np.array([], int))
+    whole, counts, _ = found(accel, warm, np.array([], int))
     assert len({block.dwell for block in whole}) > 8
     rng = np.random.default_rng(3)
     for count in rng.integers(1, 150, 50):
         blocks, counts, waited = found(accel, warm, np.sort(rng.choice(np.arange(1, len(accel)), count, replace=False)))
-        assert counts == tally and waited <= len(accel)
+        assert counts == counts and waited <= len(accel)
         for one, other in zip(blocks, whole, strict=True):
             assert (one.dwell, one.arrival_s) == (other.dwell, other.arrival_s)
             for name in ("elapsed_s", "accel_mps2", "temperature_c"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert tally.used + tally.moving + tally.settling == tally.read, astuple(tally)
+    assert counts.used + counts.moving + counts.settling == counts.read, astuple(counts)
 
 
 def at_rest(seconds: float, level: tuple[float, float, float], rng: np.random.Generator, sigma: float) -> np.ndarray:

@@ -52,7 +52,7 @@ def spans(source: Given, **how) -> list[tuple[float, float]]:
     found: dict[int, list[float]] = {}
     for block in dwell_blocks(source, segmenter):
         found.setdefault(block.dwell, []).extend([block.elapsed_s[0], block.elapsed_s[-1]])
-    spans.tally = segmenter.tally
+    spans.counts = segmenter.counts
     return [(min(times), max(times)) for times in found.values()]
 
 
@@ -71,8 +71,8 @@ def assert_between_slews(dwells: list[tuple[float, float]], early_s: float, left
 def test_dwells_between_slews(rate_hz: float, noise_deg: float) -> None:
     pose = path(*SLEWS, rate_hz=rate_hz, noise_deg=noise_deg)
     assert_between_slews(spans(Given(Batch(readings(pose, 35), pose))), 0.01, 0.6 + 1 / rate_hz)
-    tally = spans.tally
-    assert tally.used + tally.moving + tally.settling + tally.without_pose == tally.read
+    counts = spans.counts
+    assert counts.used + counts.moving + counts.settling + counts.without_pose == counts.read
 
 
 @pytest.mark.parametrize("rate_hz, noise_deg", [(10, 0.03), (50, 0.03), (50, 0.2)])
@@ -80,9 +80,9 @@ def test_noisy_angles_do_not_move_the_platform(rate_hz: float, noise_deg: float)
     """Two messages of them differ by more than the tolerance."""
     pose = path(*SLEWS, rate_hz=rate_hz, noise_deg=noise_deg)
     assert_between_slews(spans(Given(Batch(readings(pose, 35), pose))), 0.1, 1.0 + 1 / rate_hz)
-    (told,) = spans.tally.unmet_settings(Stillness())
+    (told,) = spans.counts.unmet_settings(Stillness())
     assert told.startswith("the angles scatter by ") and "--still-deg" in told
-    assert np.degrees(spans.tally.noise_rad) == pytest.approx(noise_deg, rel=0.5)
+    assert np.degrees(spans.counts.noise_rad) == pytest.approx(noise_deg, rel=0.5)
 
 
 def test_a_noisy_attitude_does_not_move_the_platform() -> None:
@@ -149,8 +149,8 @@ def test_a_platform_that_turns_in_what_counts_as_still_is_told(turn_deg: float, 
     pose = path((0, 0), (60, 1.5 * turn_deg), (64, 40), (124, 40), rate_hz=10)
     segmenter = Segmenter(BENCH, Stillness(tolerance_deg=4.0))
     assert len(list(dwell_blocks(Given(Batch(readings(pose, 124), pose)), segmenter))) > 1
-    assert segmenter.tally.turned_deg == pytest.approx(turn_deg, rel=0.05)
-    sentences = segmenter.tally.unmet_settings(segmenter.stillness)
+    assert segmenter.counts.turned_deg == pytest.approx(turn_deg, rel=0.05)
+    sentences = segmenter.counts.unmet_settings(segmenter.stillness)
     assert any("the platform turns by" in sentence for sentence in sentences) == told
 
 
@@ -164,7 +164,7 @@ def test_what_waits_in_an_open_dwell_can_be_looked_at_and_stays() -> None:
     parts = Batch(whole.accel[:split], pose[:until]), Batch(whole.accel[split:], pose[until:])
     blocks = list(looked.push(parts[0]))
     (waiting,) = looked.waiting()
-    assert not blocks and looked.standing == waiting.dwell == 1 and looked.tally.used == 0
+    assert not blocks and looked.standing == waiting.dwell == 1 and looked.counts.used == 0
     assert 7.5 < waiting.elapsed_s[-1] < 9.0 and len(waiting.elapsed_s) > 700
     assert looked.arrival_s <= 0.0, "the platform stood before the run began"
     blocks += [*looked.push(parts[1]), *looked.finish()]
@@ -185,8 +185,8 @@ def test_a_third_is_left_out_of_a_dwell_that_is_too_short_for_settling_and_that_
     pose = path((0, 0), (10, 0), (14, 40), (26, 40), (27, 80), (33, 80), (37, 40), (44, 40), rate_hz=50)
     starts = [start for start, _ in spans(Given(Batch(readings(pose, 44), pose)), settle_s=5.0)]
     assert starts == pytest.approx([0, 14 + 12 / 3, 27 + 6 / 3, 37 + 7 / 3], abs=0.4)
-    assert spans.tally.short_dwells == 2 and spans.tally.least_settling_s == pytest.approx(6 / 3, abs=0.15)
-    (told,) = spans.tally.unmet_settings(Stillness(settle_s=5.0))
+    assert spans.counts.short_dwells == 2 and spans.counts.least_settling_s == pytest.approx(6 / 3, abs=0.15)
+    (told,) = spans.counts.unmet_settings(Stillness(settle_s=5.0))
     assert told.startswith("2 dwells are too short to leave out 5 s after each arrival (--settle-s): a third of each")
 
 
@@ -269,10 +269,15 @@ def test_bad_samples_are_dropped_and_counted() -> None:
     times[20] = times[15]  # back
     times[30] += 3600 * S  # a damaged stamp far ahead
     got = spans(Given(Batch(Stream(times, accel.values), pose)))
-    tally = spans.tally
-    assert (tally.not_finite, tally.repeated, tally.backward, tally.leaping) == (2, 1, 1, 1)
-    assert tally.used == 2000 - 5 and len(got) == 1
-    said = " ".join(tally.sentences())
+    counts = spans.counts
+    assert (counts.not_finite, counts.repeated, counts.backward, counts.leaping) == (
+        2,
+        1,
+        1,
+        1,
+    )
+    assert counts.used == 2000 - 5 and len(got) == 1
+    said = " ".join(counts.sentences())
     assert "NaN" in said and "jumped back" in said and "repeated the stamp" in said and "far ahead" in said
 
 
@@ -284,8 +289,13 @@ def test_what_nothing_can_read_is_dropped_and_told(size: float) -> None:
     heat = Stream(run.accel.time_ns[[0, 500, 900]], np.array([[20.0], [size], [21.0]]))
     batch = Batch(altered.accel, altered.pose, heat)
     result = calibrate(Given(batch, bench=run.bench))
-    tally = result.tally
-    assert (tally.too_large, tally.poses_dropped, tally.temperatures_dropped, tally.not_finite) == (1, 1, 1, 0)
+    counts = result.counts
+    assert (
+        counts.too_large,
+        counts.poses_dropped,
+        counts.temperatures_dropped,
+        counts.not_finite,
+    ) == (1, 1, 1, 0)
     said = " ".join(result.warnings)
     assert "readings beyond 1e+12 m/s^2, which nothing can read, dropped: 1" in said
     assert "beyond 1e+06 rad" in said and "temperatures not finite or beyond 1e+06 degC, dropped: 1" in said
@@ -310,7 +320,7 @@ def test_counts_in_place_of_angles_are_told() -> None:
 def test_readings_outside_the_angles_are_counted() -> None:
     pose = path((5, 0), (10, 0), rate_hz=10)
     spans(Given(Batch(readings(path((0, 0), (20, 0), rate_hz=10), 20), pose)))
-    assert spans.tally.without_pose == pytest.approx(400 + 900, abs=20)
+    assert spans.counts.without_pose == pytest.approx(400 + 900, abs=20)
 
 
 def test_temperature_goes_on_as_it_went_last() -> None:
@@ -347,7 +357,7 @@ def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
             bench, grade.sensors(seed), grade.noise, spread_plan(12, dwell_s=8.0), slew_rate_degps=20.0, seed=seed
         )
         result = calibrate(run)
-        assert result.tally.gated <= 2
+        assert result.counts.gated <= 2
         p_values.append(result.consistency.p_value)
     assert np.mean(p_values) > 0.1
 
@@ -373,7 +383,7 @@ def in_parts(whole: Batch, seed: int, ahead_s: float) -> list[Batch]:
 def blocks_of(batches: list[Batch], slews: bool) -> list:
     segmenter = Segmenter(BENCH, slews=slews)
     found = list(dwell_blocks(Given(*batches), segmenter))
-    return [vars(segmenter.tally)] + [
+    return [vars(segmenter.counts)] + [
         (each.dwell, each.arrival_s, each.arrival_felt_s, each.turns, each.pose_sigma_rad, each.elapsed_s.tobytes(),
          each.accel_mps2.tobytes(), each.pose.tobytes()) for each in found
     ]  # fmt: skip

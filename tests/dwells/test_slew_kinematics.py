@@ -135,7 +135,7 @@ def test_without_such_an_effect_slews_change_nothing() -> None:
     for a, b in zip(without.fold(), beside.fold(), strict=True):
         np.testing.assert_array_equal(a.pieces.triangles, b.pieces.triangles)
     assert not without.folder.slews and len(beside.folder.slews) == 5
-    assert without.tally.moving == beside.tally.slewing and not beside.tally.moving
+    assert without.counts.moving == beside.counts.slewing and not beside.counts.moving
 
 
 @pytest.mark.parametrize("name", ["latency", "lever-arm"])

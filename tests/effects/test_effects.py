@@ -32,7 +32,7 @@ from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
 from kf_calib.noise.terms import RandomWalk
 from kf_calib.noise.within_dwells import within_dwells
-from kf_calib.online.sequential_test import Running
+from kf_calib.online.sequential_test import RecursiveTest
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient
@@ -488,18 +488,18 @@ def test_a_running_filter_is_a_refit_whatever_it_carries(
     for names_in in models:
         model = Model.of(BENCH, names_in)
         others = [effect_named(name, BENCH) for name in NAMES if name not in names_in]
-        running = Running.over(dwells[:11], model, noise, state, others, PRIORS[prior])
+        recursive = RecursiveTest.over(dwells[:11], model, noise, state, others, PRIORS[prior])
         for count in range(11, 24):
             if count in (11, 20, 23):
-                same(running, Running.over(dwells[:count], model, noise, state, (), PRIORS[prior]))
-            running = running.after(dwells[count])
+                same(recursive, RecursiveTest.over(dwells[:count], model, noise, state, (), PRIORS[prior]))
+            recursive = recursive.after(dwells[count])
 
 
-def same(running: Running, expected: Running) -> None:
+def same(recursive: RecursiveTest, expected: RecursiveTest) -> None:
     """The same model, its estimate to 1e-8 sigma (and the last bit of a scale factor of 1), the same covariance."""
-    (one, covariance, _), (other, reference, _) = running.solved(), expected.solved()
+    (one, covariance, _), (other, reference, _) = recursive.solved(), expected.solved()
     sigma = np.sqrt(np.diag(reference))
-    assert str(running.model) == str(expected.model) and (sigma[:12] > 0).all()
+    assert str(recursive.model) == str(expected.model) and (sigma[:12] > 0).all()
     assert (np.abs(one - other) <= 1e-8 * sigma + np.spacing(1.0)).all()
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=1e-9)
 

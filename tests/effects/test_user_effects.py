@@ -19,7 +19,7 @@ from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.effects import (
     Bearer,
-    FrameEffect,
+    RotationEffect,
     SensorEffect,
     as_text,
     checks,
@@ -252,7 +252,7 @@ def test_a_class_of_ten_lines_is_completed(tmp_path: Path) -> None:
 SENSOR = "from kf_calib.effects import *\nclass Own(SensorEffect):\n    def terms(self, s):\n        "
 FRAME = """from kf_calib.effects import *
 import numpy as np
-class Own(FrameEffect):
+class Own(RotationEffect):
     coefficients = (Coefficient("own", "rad", 1e-3, "rad", 1.0),)
     def rotations(self, s):
         return np.zeros((len(s), 1, 3)) + [0.0, 0.0, 1.0]
@@ -355,7 +355,7 @@ def test_register_is_a_decorator() -> None:
 def test_the_catalogue_passes_the_checks(name: str) -> None:
     effect = effect_named(name, BENCH)
     checks.check_effect(effect)
-    if isinstance(effect, FrameEffect):
+    if isinstance(effect, RotationEffect):
         assert checks.trial(BENCH).force_mps2.shape == (300, 3)
 
 

@@ -85,6 +85,6 @@ def test_damage_is_told_or_harmless(whole: Path, tmp_path: Path, how: str, trial
             assert np.nanmax(error, initial=0.0) < 6, got.warnings
         elif how != "truncated" or not expected.warnings:  # where a killed file ends is told as before
             np.testing.assert_array_equal(got.estimate.state, expected.estimate.state)
-            assert got.tally.used == expected.tally.used
+            assert got.counts.used == expected.counts.used
         path.unlink()
     assert told >= trials / 2

@@ -137,7 +137,7 @@ def test_factors_merge_and_do_not_depend_on_batches() -> None:
     whole, chopped = Run(seed=8, dwells=6, count=6000), Run(seed=8, dwells=6, count=6000, batch=777)
     one, other = calibrate(whole), calibrate(chopped)
     np.testing.assert_array_equal(one.estimate.state, other.estimate.state)
-    assert one.tally == other.tally
+    assert one.counts == other.counts
     parts = Pass(whole, Settings())
     left, right = Folder(), Folder()
     for rows in parts.rows():

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.effects import FrameEffect, Stimulus, effect_named
+from kf_calib.effects import RotationEffect, Stimulus, effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.settings import Settings
@@ -50,7 +50,7 @@ def test_columns_times_coefficients_are_the_whole_rotation(name: str) -> None:
         pose=poses, previous_pose=poses, temperature_c=np.full(8, 25.0),
         sensitivity=sensitivity,
     )  # fmt: skip
-    assert isinstance(effect, FrameEffect)
+    assert isinstance(effect, RotationEffect)
     expected = (true.inv().apply(vertical) - force) @ sensitivity.T
     np.testing.assert_allclose(effect.added(stimulus, sizes), expected, rtol=0, atol=1e-13 * 9.81)
 

@@ -21,7 +21,7 @@ from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.keys import UP
 from kf_calib.bench.raw_input import RawInput, parse_channels
 from kf_calib.bench.streams import Table
-from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.blocks import SampleCounts
 from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
@@ -192,7 +192,9 @@ def test_angles_look_like_degrees_from_three_turns_on() -> None:
 
     def refusal(turns: float) -> str:
         with pytest.raises(InputError) as refused:
-            refuse_unusable(DwellTable.of([]), Tally(read=1000, poses=100, farthest_rad=2.0 * np.pi * turns), bench)
+            refuse_unusable(
+                DwellTable.of([]), SampleCounts(read=1000, poses=100, farthest_rad=2.0 * np.pi * turns), bench
+            )
         return str(refused.value)
 
     assert begins_at(lambda turns: "degrees" in refusal(turns), 0.1, 100.0) == pytest.approx(3.0)

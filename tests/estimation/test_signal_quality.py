@@ -171,8 +171,8 @@ def test_outliers_crowd_or_do_not() -> None:
     place = 7 * 300 + 30 + 3 * np.arange(30)
     crowded.accel.values[place, 2] -= 0.1
     one, other = calibrate(spread), calibrate(crowded)
-    assert one.readings.outliers.count == one.tally.gated > 30
-    assert one.readings.outliers.by_channel == (0, one.tally.gated, 0)
+    assert one.readings.outliers.count == one.counts.gated > 30
+    assert one.readings.outliers.by_channel == (0, one.counts.gated, 0)
     assert one.readings.outliers.share == pytest.approx(0.01, rel=0.3)
     assert one.readings.outliers.clustered_p is not None and one.readings.outliers.clustered_p > 0.01
     found = other.readings.outliers

@@ -20,7 +20,7 @@ from kf_calib.diagnosis.unknown_terms import RETURNING
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.within_dwell_trend import Trend, p_of_steady_oscillation, shapes, trend, variances
-from kf_calib.online.sequential_test import Watch
+from kf_calib.online.sequential_test import SequentialTest
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
@@ -130,7 +130,7 @@ def test_dwells_that_are_noisier_than_others_show_no_trend_by_it() -> None:
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:
     """Dwell by dwell, as the diagnosis does in the end, but for noise found a quarter of the run earlier."""
     before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
-    watch = Watch.over(before.fit.dwells[:4], before.bench, before.settings)
+    watch = SequentialTest.over(before.fit.dwells[:4], before.bench, before.settings)
     for dwell in before.fit.dwells[4:]:
         watch = watch.after(dwell)
     assert watch.trend is not None and watch.alarmed is not None

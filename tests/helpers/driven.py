@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from kf_calib.bench.paper_parameters import targets_of
-from kf_calib.design.next_orientation import Pace
+from kf_calib.design.next_orientation import SlewTimes
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive
@@ -37,7 +37,7 @@ def driven(
     run = simulation(options_from_query(query), keys or {})
     bench = DrivenBench(run, servo or Servo(), [0.0] * len(run.bench.axes))
     session = Session.fed(run.bench, wanted=targets_of(targets), auto=auto)
-    pace = Pace(run.bench.rate_degps or 20.0, run.bench.acceleration_degps2 or 40.0)
-    plan = replace(Itinerary(run.bench, pace), **itinerary)
-    rules = Rules(plan.reach, plan.pace)
+    slew_times = SlewTimes(run.bench.rate_degps or 20.0, run.bench.acceleration_degps2 or 40.0)
+    plan = replace(Itinerary(run.bench, slew_times), **itinerary)
+    rules = Rules(plan.limits, plan.slew_times)
     return Drive(SimulatedPositioner(bench), session, plan, rules, SteppedTime(bench, session))

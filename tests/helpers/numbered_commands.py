@@ -23,7 +23,7 @@ from kf_calib.exchange.verification import verify
 from kf_calib.exports import TARGETS
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.online.session import Session
-from kf_calib.online.status import Judgement, Standing
+from kf_calib.online.status import Judgement, RunStatus
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import opened
 from kf_calib.views.exchange import verification_object
@@ -130,7 +130,7 @@ def live(folder: Path) -> Mapping[str, Any]:
     return told | {"figures": ResultNumbers().add(final, "judged").figures}
 
 
-def of_judgement(judged: Judgement, standing: Standing) -> Mapping[str, Any]:
+def of_judgement(judged: Judgement, standing: RunStatus) -> Mapping[str, Any]:
     """What ``live`` says beside what ``replay`` and ``diagnose`` do, and the largest of what they say."""
     told = live_object(judged, standing, None)
     return {key: told[key] for key in ("p_value", "consistent", "looks", "time_left_s", "next_orientation", "model")}

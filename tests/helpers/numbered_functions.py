@@ -12,7 +12,7 @@ from kf_calib.bench import bench, paper_parameters
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.design import gimbal_limits, optimality_criteria
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import GimbalLimits
 from kf_calib.dwells import coherent_tone, encoder_noise, line_spectrum
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.segmenter import Segmenter
@@ -165,25 +165,28 @@ def _path_deg(rng: np.random.Generator) -> Any:
 
 
 def _spans(segmenter: Segmenter, batch: Batch) -> Numbers:
-    """Number, first second, last second and count of each block, and the tally."""
+    """Number, first second, last second and count of each block, and the counts."""
     blocks = [*segmenter.push(batch), *segmenter.finish()]
     spans = [[each.dwell, each.elapsed_s[0], each.elapsed_s[-1], len(each.elapsed_s)] for each in blocks]
-    return {"tally": [each for each in vars(segmenter.tally).values() if isinstance(each, int)], "spans": spans}
+    return {
+        "counts": [each for each in vars(segmenter.counts).values() if isinstance(each, int)],
+        "spans": spans,
+    }
 
 
 def orientations() -> Numbers:
     """Limits and ways of gimbals, criteria, orders and their times."""
-    rng, reach = np.random.default_rng(5), Reach.of(LIMITED)
+    rng, limits = np.random.default_rng(5), GimbalLimits.of(LIMITED)
     poses = rng.uniform(-np.pi, np.pi, (60, 3))
-    allowed = poses[reach.allowed(poses)]
+    allowed = poses[limits.allowed(poses)]
     factors = np.array([np.triu(rng.normal(size=(12, 12))) + 3.0 * np.eye(12) for _ in range(8)])
     timing = gimbal_limits.Timing(30.0, 20.0)
     aims = (optimality_criteria.D, optimality_criteria.A, optimality_criteria.E)
-    ways = [gimbal_limits.route(reach, allowed[0], each) for each in allowed[:12]]
+    ways = [gimbal_limits.route(limits, allowed[0], each) for each in allowed[:12]]
     return figures(
-        allowed=reach.allowed(poses), rooms=reach.rooms(allowed), candidates=reach.candidates,
-        crosses=reach.crosses(allowed[:-1], allowed[1:]), free=gimbal_limits.is_free(reach, allowed[0], allowed[1:]),
-        reached=gimbal_limits.can_be_reached(reach, allowed[0], allowed), wrapped=gimbal_limits.wrap(9.0 * poses),
+        allowed=limits.allowed(poses), rooms=limits.rooms(allowed), candidates=limits.candidates,
+        crosses=limits.crosses(allowed[:-1], allowed[1:]), free=gimbal_limits.is_free(limits, allowed[0], allowed[1:]),
+        reached=gimbal_limits.can_be_reached(limits, allowed[0], allowed), wrapped=gimbal_limits.wrap(9.0 * poses),
         ways=[way if way is not None else [] for way in ways], scores=[aim(factors) for aim in aims],
         soft=[aim(factors, 8.0) for aim in aims], sigmas=optimality_criteria.sigmas(factors),
         slopes=[optimality_criteria.slope(aim, factors[0], 8.0) for aim in aims],
@@ -213,7 +216,7 @@ def driving() -> Numbers:
 
 def _driven(rng: np.random.Generator) -> list[Any]:
     """The times and the kinds of the commands of one run whose platform is wrong by sizes drawn over decades."""
-    rules, state, now_s, told = loop.Rules(Reach.of(LIMITED)), loop.State(), 0.0, list[Any]()
+    rules, state, now_s, told = loop.Rules(GimbalLimits.of(LIMITED)), loop.State(), 0.0, list[Any]()
     here, goal = np.zeros(3), np.zeros(3)
     off, late, drift, speed = np.exp(rng.uniform(np.log(1e-3), np.log(30.0), 4)) * (rng.random(4) < 0.5)
     heard, going = 0, None

@@ -10,33 +10,33 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
-from kf_calib.online.sequential_test import Running, Watch
+from kf_calib.online.sequential_test import RecursiveTest, SequentialTest
 
 
 def quiet(seed: int, **kwargs: float) -> Calibration:
     return calibrate(Run(seed=seed, dwells=16, count=100, **kwargs))
 
 
-def watched(result: Calibration) -> Watch:
+def watched(result: Calibration) -> SequentialTest:
     dwells = result.fit.dwells
-    watch = Watch.over(dwells[:6], result.bench)
+    sequential = SequentialTest.over(dwells[:6], result.bench)
     for dwell in dwells[6:]:
-        watch = watch.after(dwell)
-    return watch
+        sequential = sequential.after(dwell)
+    return sequential
 
 
 def test_a_running_scan_is_that_from_the_start() -> None:
     result = quiet(1)
     effects = [each for each in candidates(result.model) if each.unknown is None]
     dwells, noise = result.fit.dwells, result.noise.for_goodness_of_fit
-    running = Running.over(dwells[:8], result.model, noise, result.linearised.state, effects)
+    recursive = RecursiveTest.over(dwells[:8], result.model, noise, result.linearised.state, effects)
     for dwell in dwells[8:]:
-        running = running.after(dwell)
+        recursive = recursive.after(dwell)
     expected = scan(result.linearised, noise, effects)
-    np.testing.assert_allclose(running.scan.statistics, expected.statistics, rtol=1e-6, atol=1e-7)
-    statistic, dof = running.misfit
+    np.testing.assert_allclose(recursive.scan.statistics, expected.statistics, rtol=1e-6, atol=1e-7)
+    statistic, dof = recursive.misfit
     assert dof == result.consistency.dof or dof > result.consistency.dof  # columns within dwells add rows
-    own = [sum(c.dof for c in each.candidates) for each in (running.scan, expected)]
+    own = [sum(c.dof for c in each.candidates) for each in (recursive.scan, expected)]
     assert own[0] == own[1] and statistic == pytest.approx(float(dof), abs=6.0 * np.sqrt(2.0 * dof))
 
 
@@ -50,9 +50,9 @@ def test_noise_raises_no_alarm_however_often_it_is_looked_at() -> None:
 
 
 def test_a_missing_effect_raises_the_alarm_before_the_end() -> None:
-    watch = watched(run("second-order=20sigma"))
-    assert watch.alarmed is not None and watch.alarmed < 24
-    assert watch.suspects[0] in {"second-order", "scale-asymmetry"}
+    sequential = watched(run("second-order=20sigma"))
+    assert sequential.alarmed is not None and sequential.alarmed < 24
+    assert sequential.suspects[0] in {"second-order", "scale-asymmetry"}
 
 
 def test_a_dwell_more_has_the_columns_that_the_whole_run_gives_it() -> None:

@@ -45,7 +45,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online import status
 from kf_calib.online.evaluation import targets
 from kf_calib.online.session import Session
-from kf_calib.online.status import Judgement, Standing, current, judge_so_far
+from kf_calib.online.status import Judgement, RunStatus, current, judge_so_far
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
 from kf_calib.sources.simulation.detectability import sized
@@ -124,7 +124,7 @@ def test_live_is_replay_to_the_bit_and_a_judgement_a_dwell() -> None:
     equal(found[-1], Settings(), bench(orientations=7, batch=1 << 16))
     assert [len(each.result.visits) for each in found] == [1, 2, 3, 4, 5, 6, 7, 7]
     assert [each.consistent for each in found[:4]] == [None] * 4 and found[-1].consistent is True
-    assert session.standing.samples == found[-1].result.tally.read and session.standing.dwells == 7
+    assert session.standing.samples == found[-1].result.counts.read and session.standing.dwells == 7
 
 
 def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_restart() -> None:
@@ -185,7 +185,9 @@ def test_candidates_are_tried_again_only_where_that_may_say_something_else(
     diagnosed = diagnosed_once(monkeypatch, is_once)
     monkeypatch.setattr(status, "assess_candidates", lambda *_: pytest.fail("nobody has asked"))
     judgements = judged_one_by_one(bench(f"second-order={sigmas}sigma", orientations=orientations, seed=9))
-    alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
+    alarmed = [
+        k for k, each in judgements.items() if each.sequential is not None and each.sequential.alarmed is not None
+    ]
     assert 5 < alarmed[0], (alarmed, diagnosed)
     assert alarmed[0] == diagnosed[0]
     if not is_once and len(diagnosed) == len(alarmed):
@@ -194,8 +196,10 @@ def test_candidates_are_tried_again_only_where_that_may_say_something_else(
     for k, each in judgements.items():
         assert len(each.result.visits) == k
         if k in alarmed:
-            assert k in diagnosed or (each.look.settled and k < 1.25 * len(each.look.result.visits))
-            assert each.alarm and "second-order" in each.suspects and f"look {each.watch.looks}" not in each.verdict
+            assert k in diagnosed or (each.snapshot.settled and k < 1.25 * len(each.snapshot.result.visits))
+            assert (
+                each.alarm and "second-order" in each.suspects and f"look {each.sequential.looks}" not in each.verdict
+            )
 
 
 def judged_one_by_one(source: Simulation) -> dict[int, Judgement]:
@@ -237,7 +241,7 @@ def test_time_to_a_target_is_the_time_it_takes() -> None:
     needed = whole.fit.dwells[-1].end_s - whole.fit.dwells[7].end_s
     left = first.left_s
     assert np.isfinite(left).all() and 0.25 * needed < np.median(left) <= 1.2 * needed
-    assert first.course is not None and (first.course.sigma[-1] < first.result.estimate.sigma).all()
+    assert first.forecast is not None and (first.forecast.sigma[-1] < first.result.estimate.sigma).all()
 
 
 @pytest.mark.slow
@@ -333,7 +337,7 @@ def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
 
 
 def seen(
-    standing: Standing, status: Status | None = None, recording: str = "", hint: str = "",
+    standing: RunStatus, status: Status | None = None, recording: str = "", hint: str = "",
     doing: Doing | None = None, width: int = 80,
 ) -> str:  # fmt: skip
     return plain(screen(content_of(standing, status, "sim://", recording, doing), hint), width=width)

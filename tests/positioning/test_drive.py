@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.driven import driven
 
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import GimbalLimits
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.loop import Phase
 from kf_calib.positioning.positioner import Positioner, PositionerError
@@ -125,7 +125,7 @@ def test_commands_and_ways_keep_within_limits_and_out_of_forbidden_zones() -> No
     """By where the platform truly was, at every look."""
     keys = {"limits_deg": "outer=-120:120 x=-100:100", "forbidden_deg": "z=20:70,x=-40:40; y=60:90,z=-90:-30"}
     drive = driven(keys=keys, targets=("K=10ppm", "b=60ug"))
-    reach, witness = Reach.of(bench_of(drive).run.bench), Witness(drive)
+    limits, witness = GimbalLimits.of(bench_of(drive).run.bench), Witness(drive)
     been, sleep = list[tuple[float, ...]](), drive.clock.sleep
 
     def watched(seconds: float) -> None:
@@ -135,8 +135,8 @@ def test_commands_and_ways_keep_within_limits_and_out_of_forbidden_zones() -> No
     drive.clock.sleep = watched
     outcome = drive.run()
     assert outcome.ended == "targets", outcome.why
-    assert reach.allowed(np.radians(been)).all()
-    assert reach.allowed(np.radians(witness.moves)).all()
+    assert limits.allowed(np.radians(been)).all()
+    assert limits.allowed(np.radians(witness.moves)).all()
     rates = np.abs(np.diff(been, axis=0)).max() / drive.clock.tick_s
     assert rates <= 20.0 + 1e-6
 

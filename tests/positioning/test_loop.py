@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.design.gimbal_limits import Reach, can_be_reached, is_free, route
+from kf_calib.design.gimbal_limits import GimbalLimits, can_be_reached, is_free, route
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning.loop import Ask, End, Halt, Move, Phase, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Watchfulness
 
 BENCH = Bench(axes_of("yzx"), 9.81, limits_deg="z=-90:90", forbidden_deg="y=30:60,x=-20:20")
-RULES = Rules(Reach.of(BENCH))
+RULES = Rules(GimbalLimits.of(BENCH))
 GOING = Suggestion("opening", "why", (90.0, 0.0, 90.0), 5.0)
 TICK_S = 0.1
 
@@ -140,24 +140,29 @@ angles = st.tuples(st.integers(-180, 180), st.integers(-90, 90), st.integers(-18
 @settings(max_examples=200, deadline=None)
 def test_a_way_enters_no_zone_however_fast_each_gimbal_goes(start: tuple, end: tuple) -> None:
     """By poses drawn in the box between the stations: each gimbal anywhere between its two angles."""
-    reach, here, there = RULES.reach, np.radians(start), np.radians(end)
-    if not reach.allowed(here[None])[0]:
+    limits, here, there = RULES.limits, np.radians(start), np.radians(end)
+    if not limits.allowed(here[None])[0]:
         return
-    way = route(reach, here, there)
-    assert (way is not None) == can_be_reached(reach, here, there[None])[0]
+    way = route(limits, here, there)
+    assert (way is not None) == can_be_reached(limits, here, there[None])[0]
     if way is None:
         return
     rng = np.random.default_rng(0)
     assert np.array_equal(way[-1], there)
     for before, after in zip([here, *way[:-1]], way, strict=True):
-        assert is_free(reach, before, after[None])[0]
+        assert is_free(limits, before, after[None])[0]
         between = before + rng.random((200, 3)) * (after - before)
-        assert reach.allowed(between).all()
+        assert limits.allowed(between).all()
 
 
 def played(gains: np.ndarray, silent: bool = False) -> tuple[list[object], list[tuple[float, ...]]]:
     """Commands and places of a loop whose platform turns by ``gains`` (3, 3) of what the read-back says."""
-    rules, state, now_s, here = Rules(Reach.of(Bench(axes_of("yzx"), 9.81))), begun(first=True), 20.0, np.zeros(3)
+    rules, state, now_s, here = (
+        Rules(GimbalLimits.of(Bench(axes_of("yzx"), 9.81))),
+        begun(first=True),
+        20.0,
+        np.zeros(3),
+    )
     commands, places = list[object](), list[tuple[float, ...]]()
     state, command = step(state, Seen(now_s, tuple(here), suggestion=GOING), rules)
     for _ in range(1500):

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from positioner_emulator import MISBEHAVIOURS
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import GimbalLimits
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
@@ -85,7 +85,7 @@ def test_what_comes_too_late_or_unasked_answers_no_later_question(
 def drive_of(opened: Opened, table: Table) -> Drive:
     session = Session.fed(table.bench.run.bench)
     return Drive(
-        opened.positioner, session, Itinerary(session.source.bench), Rules(Reach.of(BENCH), watch=opened.watch)
+        opened.positioner, session, Itinerary(session.source.bench), Rules(GimbalLimits.of(BENCH), watch=opened.watch)
     )
 
 

@@ -19,10 +19,10 @@ from kf_calib import plot
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
-from kf_calib.design.gimbal_limits import Reach, Timing
+from kf_calib.design.gimbal_limits import GimbalLimits, Timing
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.design.orientation_plan import plan as planned
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import Comparison, compare
 from kf_calib.estimation.filter_history import history_of, innovation_tests
@@ -63,7 +63,9 @@ def made() -> Plan:
     bench = Bench.from_metadata({"axes": "y z x", "gravity_mps2": "9.81"})
     wanted = np.full(12, np.inf)
     wanted[2::4] = 4e-7
-    search = Search(Prospect.of_bench(bench, 1e-4, 1000, 30.0), Reach(bench), optimality_criteria.minimax(wanted))
+    search = Search(
+        PredictedInformation.of_bench(bench, 1e-4, 1000, 30.0), GimbalLimits(bench), optimality_criteria.minimax(wanted)
+    )
     return planned(search, 6, Timing(30.0, 20.0))
 
 

@@ -13,9 +13,9 @@ from kf_calib.bench.bench import Bench
 from kf_calib.cli.acquire import _hidden_table
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
-from kf_calib.design.gimbal_limits import Reach, Timing
+from kf_calib.design.gimbal_limits import GimbalLimits, Timing
 from kf_calib.design.orientation_plan import plan
-from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.predicted_information import PredictedInformation
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import improve
@@ -56,7 +56,7 @@ def _compared(result: Calibration) -> RenderableType:
 
 
 def _plan(result: Calibration) -> RenderableType:
-    search = Search(Prospect.of_bench(BENCH, 1e-4, 100, 30.0), Reach(BENCH), optimality_criteria.D)
+    search = Search(PredictedInformation.of_bench(BENCH, 1e-4, 100, 30.0), GimbalLimits(BENCH), optimality_criteria.D)
     return plans.plan_report(plan(search, 4, Timing(30.0, 20.0)), beside_paper=True)
 
 

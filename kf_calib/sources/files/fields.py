@@ -80,14 +80,15 @@ class Fields:
         return cls(match["quantity"], match["topic"].strip(), paths, names, match["time"])
 
     @cached_property
-    def _steps(self) -> list[list[str]]:
+    def _segments(self) -> list[list[str]]:
+        """Return the names of the nested fields in each path."""
         return [path.split(".") for path in self.paths]
 
     def numbers(self, message: Any) -> list[float]:
         """The numbers in a message. Raises MessageError."""
         numbers = list[float]()
-        for path, steps in zip(self.paths, self._steps, strict=True):
-            value = _at(message, steps, path)
+        for path, segments in zip(self.paths, self._segments, strict=True):
+            value = _at(message, segments, path)
             if type(value) is float:
                 numbers.append(value)
             else:

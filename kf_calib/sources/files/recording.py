@@ -305,6 +305,7 @@ class _Passage:
         self._marks = list[Metadata]()
 
     def track(self, topic: str, decode: Decoder | FieldDecoder) -> _Track:
+        """Return a track that takes the messages of a topic from the blocks that are read."""
         track = _Track(self.contents, topic, decode)
         self._tracks.append(track)
         return track

@@ -20,7 +20,7 @@ from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.injected.kinds import Hidden, Rig, Stage, steps_of
+from kf_calib.sources.simulation.injected.kinds import Hidden, SimulatedBench, Stage, steps_of
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
@@ -151,8 +151,8 @@ class Simulation:
 
     def parameters_at_end(self) -> dict[str, float] | None:
         """The parameters at the last reading, where the biases have walked there; None where they have not."""
-        rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
-        processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
+        simulated, noise = self._simulated, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
+        processes = noise.processes(self.seed, simulated.period_s, simulated.duration_s)
         hidden = chain.from_iterable(self._hidden_steps().values())
         processes += [step.process for step in hidden if isinstance(step, WalkingBias)]
         if not processes:
@@ -174,12 +174,14 @@ class Simulation:
         return turned, [*platform, *force, *sensed, *self._noise_steps(), *hidden["record"]]
 
     def _hidden_steps(self) -> dict[Stage, list[TrueStep]]:
-        return steps_of(self.hidden, self._rig)
+        return steps_of(self.hidden, self._simulated)
 
     @property
-    def _rig(self) -> Rig:
+    def _simulated(self) -> SimulatedBench:
         period_s = self._accel.period_ns * 1e-9
-        return Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
+        return SimulatedBench(
+            self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed
+        )
 
     def _setting_steps(self) -> list[TrueStep]:
         if not self.noise.setting_sigma_deg:

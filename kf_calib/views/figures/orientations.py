@@ -148,7 +148,7 @@ def draw_angles(axes: Axes, made: Plan) -> None:
     """Draw the angles of the gimbals in the order of the visits."""
     numbers = np.arange(1, len(made.poses) + 1)
     for angles, name, colour, marker in zip(
-        made.gimbal_deg.T, gimbal_names(made.prospect.model.bench), _GIMBALS, "osDv", strict=False
+        made.gimbal_deg.T, gimbal_names(made.information.model.bench), _GIMBALS, "osDv", strict=False
     ):
         axes.plot(numbers, angles, f":{marker}", color=colour, markersize=4.0, linewidth=0.9,
                   label=f"gimbal {name.replace('_', ' ')}")  # fmt: skip
@@ -214,7 +214,7 @@ def _sigma_bars(axes: Axes, group: list[int], before: Floats, sigma: Floats, tar
 @drawn_on()
 def predicted_sigmas(figure: Figure, made: Plan) -> None:
     """Predicted sigma of every parameter against the number of orientations, with targets if any."""
-    names = with_coefficients(made.prospect.model.coefficients)
+    names = with_coefficients(made.information.model.coefficients)
     draw_sigmas(figure, np.arange(len(made.sigma), dtype=float), made.sigma, names, made.targets)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.online.evaluation import Progress
 from kf_calib.online.session import HandJudgement, HandStanding
-from kf_calib.online.status import Judgement, Standing
+from kf_calib.online.status import Judgement, RunStatus
 from kf_calib.support.text import angles_in_words, counted, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
@@ -101,7 +101,7 @@ _LAST = Task("THE READINGS HAVE ENDED", "the whole run is evaluated", "green")
 
 
 def content_of(
-    standing: Standing | HandStanding, status: Status | None, name: str, recording: str = "",
+    standing: RunStatus | HandStanding, status: Status | None, name: str, recording: str = "",
     doing: Doing | None = None,
 ) -> Content:  # fmt: skip
     """What is shown of a run.
@@ -183,7 +183,7 @@ def source_lines(standing: Progress, status: Status | None, name: str, recording
     return lines
 
 
-def _bench_task(standing: Standing, doing: Doing | None) -> Task:
+def _bench_task(standing: RunStatus, doing: Doing | None) -> Task:
     """Return what to do now, or what the bench does by itself, in capitals, and where the platform stands and where it
     is to go next."""
     judgement, here = standing.judgement, standing.current
@@ -209,7 +209,7 @@ def _bench_task(standing: Standing, doing: Doing | None) -> Task:
     return Task("STAY: HOLD STILL", f"{at}; then to {there}{f', which {why}' * bool(why)}", "yellow")
 
 
-def _bench_rows(standing: Standing) -> tuple[Headings, list[SigmaRow]]:
+def _bench_rows(standing: RunStatus) -> tuple[Headings, list[SigmaRow]]:
     """Return headings and rows of the twelve sigmas with what they are to come down to, in what time: their targets, or
     where none is set half of what they were after the last orientation."""
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.aims

@@ -47,10 +47,10 @@ def _of_bench(judgement: Judgement) -> dict[str, Any]:
     """Return the keys of a run on a bench alone."""
     return {
         "p_value": judgement.p_value,
-        "diagnosed_dwells": len(judgement.look.result.visits),
+        "diagnosed_dwells": len(judgement.snapshot.result.visits),
         "next_orientation": _going(judgement),
         "alarm": judgement.alarm,
-        "looks": judgement.watch.looks if judgement.watch else 0,
+        "looks": judgement.sequential.looks if judgement.sequential else 0,
         "elapsed_s": judgement.result.fit.dwells[-1].end_s,
         "time_left_s": dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True)),
     }
@@ -96,7 +96,7 @@ def _bench_line(judgement: Judgement) -> str:
     per_dof = result.consistency.nis_per_dof
     nis = "" if per_dof is None else f"; misfit {math.sqrt(per_dof):.2g} × noise"
     return (
-        f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
+        f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.counts.read} readings; {seen}{nis}; "
         f"{judgement.verdict}{following}"
     )
 

@@ -12,7 +12,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axis_names
 from kf_calib.estimation.free_attitude import DIRECTIONS
 from kf_calib.online.session import HandStanding
-from kf_calib.online.status import Standing
+from kf_calib.online.status import RunStatus
 from kf_calib.support.text import angles_in_words
 from kf_calib.views.live.content import Content
 
@@ -36,7 +36,9 @@ def page_object(
     return {**asdict(content), "directions": list(map(asdict, directions)), "gimbals": gimbals}
 
 
-def gimbals_of(standing: Standing | HandStanding, bench: Bench, heading: Sequence[float] = ()) -> list[tuple[str, str]]:
+def gimbals_of(
+    standing: RunStatus | HandStanding, bench: Bench, heading: Sequence[float] = ()
+) -> list[tuple[str, str]]:
     """Each gimbal's name and the angle of the next orientation, deg, outer to inner; empty where none is advised.
 
     heading: where a bench that drives itself goes, deg.
@@ -48,20 +50,20 @@ def gimbals_of(standing: Standing | HandStanding, bench: Bench, heading: Sequenc
     ]
 
 
-def _next_angles(standing: Standing | HandStanding) -> Sequence[float]:
+def _next_angles(standing: RunStatus | HandStanding) -> Sequence[float]:
     if isinstance(standing, HandStanding) or standing.judgement is None or standing.judgement.final:
         return ()
     going = standing.judgement.next_orientation
     return () if going is None else going[0]
 
 
-def directions_of(standing: Standing | HandStanding, bench: Bench, heading: Sequence[float] = ()) -> list[Direction]:
+def directions_of(standing: RunStatus | HandStanding, bench: Bench, heading: Sequence[float] = ()) -> list[Direction]:
     """Directions of specific force in the platform in all dwells that are judged, in the open one, and in the next
     orientation; ``heading`` as of ``gimbals_of``."""
     return _by_hand(standing) if isinstance(standing, HandStanding) else _on_bench(standing, bench, heading)
 
 
-def _on_bench(standing: Standing, bench: Bench, heading: Sequence[float]) -> list[Direction]:
+def _on_bench(standing: RunStatus, bench: Bench, heading: Sequence[float]) -> list[Direction]:
     judgement, here = standing.judgement, standing.current
     dwells = [] if judgement is None else [visit.dwell for visit in judgement.result.visits]
     wrong = judgement.disagreeing[0] if judgement is not None and judgement.alarm else 0

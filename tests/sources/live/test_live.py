@@ -98,7 +98,7 @@ def test_the_simulator_live_gives_what_a_replay_gives_bit_for_bit(tmp_path: Path
     replayed = calibrate(Recording(tmp_path / "a.mcap"))
     assert live.estimate.state.tobytes() == replayed.estimate.state.tobytes()
     assert live.estimate.covariance.tobytes() == replayed.estimate.covariance.tobytes()
-    assert live.tally == replayed.tally
+    assert live.counts == replayed.counts
 
 
 def test_a_file_that_grows_is_followed_until_nothing_comes(tmp_path: Path) -> None:

@@ -373,8 +373,8 @@ def test_a_run_through_a_restart_replays_bit_for_bit(tmp_path: Path) -> None:
     with LiveSource(feed, tmp_path / "a.mcap") as source:
         live = calibrate(source)
     replayed, undisturbed = calibrate(Recording(tmp_path / "a.mcap")), calibrate(run)
-    assert source.status.clock_restarts == 1 and live.tally.backward == live.tally.repeated == 0
-    assert live.tally.used == pytest.approx(undisturbed.tally.used, abs=100)
+    assert source.status.clock_restarts == 1 and live.counts.backward == live.counts.repeated == 0
+    assert live.counts.used == pytest.approx(undisturbed.counts.used, abs=100)
     assert live.estimate.state.tobytes() == replayed.estimate.state.tobytes()
     assert live.estimate.covariance.tobytes() == replayed.estimate.covariance.tobytes()
 

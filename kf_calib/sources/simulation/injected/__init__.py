@@ -41,7 +41,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError, how_to_write
-from kf_calib.sources.simulation.injected.kinds import INNER, EffectKind, Hidden, NoSizeError, catalogue
+from kf_calib.sources.simulation.injected.kinds import INNER_CONSTANTS, EffectKind, Hidden, NoSizeError, catalogue
 from kf_calib.sources.simulation.sensors import generator
 from kf_calib.support.units import si
 
@@ -183,7 +183,7 @@ def _inner(kind: EffectKind, texts: Iterable[str]) -> dict[str, float]:
             words = ", ".join(kind.inner) or "none"
             raise InputError(f"{kind.name} has no constant {name!r}: it has {words}.")
         values[name] = si(value)
-        if INNER[name].positive and values[name] <= 0.0:
+        if INNER_CONSTANTS[name].positive and values[name] <= 0.0:
             raise InputError(f"{name} of {kind.name} is {values[name]:g}: give a positive number.")
     return values
 
@@ -232,7 +232,7 @@ def _draw(rng: np.random.Generator, kinds: Sequence[EffectKind], axes: Sequence[
     size = float(np.exp(rng.uniform(*np.log(kind.typical(grade)))))
     signs = rng.choice([-1.0, 1.0], len(kind.coefficients)) if kind.signed else np.ones(len(kind.coefficients))
     inner = {
-        name: value * float(2.0 ** rng.uniform(-1.0, 1.0)) if INNER[name].free else value
+        name: value * float(2.0 ** rng.uniform(-1.0, 1.0)) if INNER_CONSTANTS[name].free else value
         for name, value in kind.inner.items()
     }
     axis_name = axis_names(axes)[axis] if kind.per_axis else ""

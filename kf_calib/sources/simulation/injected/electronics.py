@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.injected.kinds import Rig, made
+from kf_calib.sources.simulation.injected.kinds import SimulatedBench, made
 from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep, adding, along, putting
 from kf_calib.sources.simulation.sensors import OutlierProcess
 
@@ -13,7 +13,7 @@ _PAIRS = ("12", "13", "21", "23", "31", "32")
 
 
 @made("cross-talk", "1", ("1ppm", "100ppm"), ("0.1permille", "2permille"), coefficients=_PAIRS)
-def cross_talk(x: Floats, rig: Rig) -> TrueStep:
+def cross_talk(x: Floats, simulated: SimulatedBench) -> TrueStep:
     """Cross-talk: X_ij A_j of the other two readings, without their noise (acquisition chain)."""
     mixing = np.zeros((3, 3))
     mixing[~np.eye(3, dtype=bool)] = x
@@ -21,21 +21,21 @@ def cross_talk(x: Floats, rig: Rig) -> TrueStep:
 
 
 @made("outliers", "m/s^2", ("1mg", "100mg"), ("10mg", "1g"), stage="record", signed=False)
-def outliers(size: Floats, rig: Rig, *, rate: float = 1e-3) -> TrueStep:
+def outliers(size: Floats, simulated: SimulatedBench, *, rate: float = 1e-3) -> TrueStep:
     """Outliers: single readings jump by the size, either way, with probability ``rate`` (transmission)."""
-    jumps = OutlierProcess(rig.generator("outliers"), rate, 1.0)
+    jumps = OutlierProcess(simulated.generator("outliers"), rate, 1.0)
     return Disturbance(lambda count: size * jumps(count))
 
 
 @made("saturation", "m/s^2", ("0.7g", "0.98g"), ("0.7g", "0.98g"), stage="record", signed=False)
-def saturation(limit: Floats, rig: Rig) -> TrueStep:
+def saturation(limit: Floats, simulated: SimulatedBench) -> TrueStep:
     """Saturation: readings stop at -limit and +limit; 0 is no limit (IEEE Std 528, full range)."""
     least = np.where(limit > 0.0, limit, np.inf)
     return putting("reading_mps2", lambda state: np.clip(state.reading_mps2, -least, least))
 
 
 @made("quantisation", "m/s^2", ("10ug", "1mg"), ("1mg", "50mg"), stage="record", signed=False)
-def quantisation(step_size: Floats, rig: Rig) -> TrueStep:
+def quantisation(step_size: Floats, simulated: SimulatedBench) -> TrueStep:
     """Quantisation: readings are whole multiples of the step (IEEE Std 952, Q)."""
     coarse = step_size > 0.0
     width = np.where(coarse, step_size, 1.0)

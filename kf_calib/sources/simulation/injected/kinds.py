@@ -31,7 +31,7 @@ class NoSizeError(InputError):
 
 
 @dataclass(frozen=True)
-class Rig:
+class SimulatedBench:
     """The bench an effect is at work on."""
 
     bench: Bench
@@ -48,7 +48,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Inner:
+class InnerConstant:
     """A constant of an effect beside its coefficients. free: ``random`` draws it within a factor of 2."""
 
     unit: str
@@ -56,26 +56,26 @@ class Inner:
     free: bool = True
 
 
-INNER: Mapping[str, Inner] = {
-    "tau": Inner("s"),
-    "slow": Inner("s"),
-    "period": Inner("s"),
-    "frequency": Inner("Hz"),
-    "chirp": Inner("Hz/s"),
-    "rms": Inner("m/s^2"),
-    "rate": Inner("1"),
-    "share": Inner("1"),
-    "cx": Inner("1"),
-    "cy": Inner("1"),
-    "cz": Inner("1"),
-    "play": Inner("K", free=False),
-    "phase": Inner("rad", positive=False),
-    "threshold": Inner("m/s^2", free=False),
-    "reference": Inner("degC", positive=False, free=False),
-    "latitude": Inner("rad", positive=False, free=False),
-    "north": Inner("T", positive=False, free=False),
-    "up": Inner("T", positive=False, free=False),
-    "east": Inner("T", positive=False, free=False),
+INNER_CONSTANTS: Mapping[str, InnerConstant] = {
+    "tau": InnerConstant("s"),
+    "slow": InnerConstant("s"),
+    "period": InnerConstant("s"),
+    "frequency": InnerConstant("Hz"),
+    "chirp": InnerConstant("Hz/s"),
+    "rms": InnerConstant("m/s^2"),
+    "rate": InnerConstant("1"),
+    "share": InnerConstant("1"),
+    "cx": InnerConstant("1"),
+    "cy": InnerConstant("1"),
+    "cz": InnerConstant("1"),
+    "play": InnerConstant("K", free=False),
+    "phase": InnerConstant("rad", positive=False),
+    "threshold": InnerConstant("m/s^2", free=False),
+    "reference": InnerConstant("degC", positive=False, free=False),
+    "latitude": InnerConstant("rad", positive=False, free=False),
+    "north": InnerConstant("T", positive=False, free=False),
+    "up": InnerConstant("T", positive=False, free=False),
+    "east": InnerConstant("T", positive=False, free=False),
 }
 """Names of constants and what they are."""
 
@@ -84,7 +84,7 @@ INNER: Mapping[str, Inner] = {
 class EffectKind:
     """A kind of effect.
 
-    unit: of a coefficient. navigation, mems: typical sizes of these grades. make: (coefficients, rig, gimbal axis where
+    unit: of a coefficient. navigation, mems: typical sizes of these grades. make: (coefficients, bench, gimbal axis if
     ``per_axis``, inner constants) -> step. stage: where in the chain it stands. coefficients: their names, one for each
     size. signed: false where one cannot be negative. known: it is in the catalogue of the diagnosis. counted: makes
     the part that counts to its size in sigma, where something comes with the effect whatever its size. driver: of an
@@ -142,7 +142,9 @@ class Hidden:
             "family": self.kind.family,
             "unit": self.kind.unit,
             "sizes": dict(zip(self.kind.coefficients, self.sizes, strict=True)),
-            "inner": {name: {"value": value, "unit": INNER[name].unit} for name, value in self._inner.items()},
+            "inner": {
+                name: {"value": value, "unit": INNER_CONSTANTS[name].unit} for name, value in self._inner.items()
+            },
             "physics": self.kind.physics,
         }
 
@@ -150,10 +152,10 @@ class Hidden:
         """The same with every coefficient times a number."""
         return replace(self, sizes=tuple(factor * size for size in self.sizes))
 
-    def step(self, rig: Rig) -> TrueStep:
+    def step(self, simulated: SimulatedBench) -> TrueStep:
         """The step in the chain, fresh from its start."""
         axis = (self.axis,) if self.kind.per_axis else ()
-        return self.kind.make(np.array(self.sizes), rig, *axis, **self._inner)
+        return self.kind.make(np.array(self.sizes), simulated, *axis, **self._inner)
 
     @property
     def counted(self) -> Hidden:
@@ -173,13 +175,13 @@ def catalogue() -> Mapping[str, EffectKind]:
     return _KINDS
 
 
-def steps_of(effects: Iterable[Hidden], rig: Rig) -> dict[Stage, list[TrueStep]]:
+def steps_of(effects: Iterable[Hidden], simulated: SimulatedBench) -> dict[Stage, list[TrueStep]]:
     """The steps of those effects that are not of size zero, by stage, in the order of the catalogue."""
     order = list(_KINDS)
     present = [effect for effect in effects if any(effect.sizes)]
     steps: dict[Stage, list[TrueStep]] = {stage: [] for stage in get_args(Stage)}
     for effect in sorted(present, key=lambda effect: order.index(effect.kind.name)):
-        steps[effect.kind.stage].append(effect.step(rig))
+        steps[effect.kind.stage].append(effect.step(simulated))
     return steps
 
 
@@ -206,7 +208,7 @@ def added(
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
     def register(contribution: Callable[..., Floats]) -> Callable[..., Floats]:
-        def make(k: Floats, rig: Rig, **inner: float) -> TrueStep:
+        def make(k: Floats, simulated: SimulatedBench, **inner: float) -> TrueStep:
             return adding(lambda state: contribution(k, state, **inner))
 
         make.__doc__ = contribution.__doc__

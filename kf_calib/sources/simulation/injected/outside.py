@@ -9,7 +9,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, harmonic
-from kf_calib.sources.simulation.injected.kinds import Rig, above, added, column, made, output, pendulous
+from kf_calib.sources.simulation.injected.kinds import SimulatedBench, above, added, column, made, output, pendulous
 from kf_calib.sources.simulation.physics import TrueState, TrueStep, adding, carried_by_earth, rotate, turning_platform
 from kf_calib.sources.simulation.sensors import FirstOrder
 from kf_calib.sources.simulation.visit_plans import attitude
@@ -27,9 +27,9 @@ _made(
 
 @_made("thermal-tilt", "rad/K", ("5urad/K", "50urad/K"), ("0.1mrad/K", "1mrad/K"),
        stage="attitude", coefficients=("N", "E"), driver="temperature", family="temperature")  # fmt: skip
-def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> TrueStep:
+def thermal_tilt(delta: Floats, simulated: SimulatedBench, *, reference: float = 25.0) -> TrueStep:
     """Thermal tilt of the pier: the base is turned by T (delta N about North, delta E about East)."""
-    return base_turning(delta, rig, lambda state: above(state, reference)[:, 0])
+    return base_turning(delta, simulated, lambda state: above(state, reference)[:, 0])
 
 
 @_added("fifth-order", "1/(m/s^2)^4", ("5ug/g^5", "100ug/g^5"), ("2mg/g^5", "20mg/g^5"),
@@ -69,9 +69,9 @@ def thermal_scale_2(k: Floats, state: TrueState, *, reference: float = 25.0) -> 
 
 
 @_made("bias-jump", *_BIAS, driver="time", family="bias in time")
-def bias_jump(k: Floats, rig: Rig, *, share: float = 0.4) -> TrueStep:
+def bias_jump(k: Floats, simulated: SimulatedBench, *, share: float = 0.4) -> TrueStep:
     """Jump of the bias: constant from ``share`` of the run on, where something in the sensor has given way."""
-    start_s = share * rig.duration_s
+    start_s = share * simulated.duration_s
     return adding(lambda state: k * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
@@ -89,10 +89,10 @@ def chirp(k: Floats, state: TrueState, *, frequency: float = 2e-3, chirp: float 
 
 
 @_made("telegraph", *_BIAS, driver="time", family="bias in time")
-def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> TrueStep:
+def telegraph(k: Floats, simulated: SimulatedBench, *, tau: float = 200.0) -> TrueStep:
     """Telegraph noise: each bias switches between -k and +k, staying tau on average (burst or popcorn noise)."""
-    chance = -0.5 * np.expm1(-2.0 * rig.period_s / tau)
-    rng, level = rig.generator("telegraph"), np.ones((1, 3))
+    chance = -0.5 * np.expm1(-2.0 * simulated.period_s / tau)
+    rng, level = simulated.generator("telegraph"), np.ones((1, 3))
 
     def contribution(state: TrueState) -> Floats:
         nonlocal level
@@ -105,14 +105,14 @@ def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> TrueStep:
 
 
 @_made("previous-pose", *_BIAS, driver="previous orientation", family="memory")
-def previous_pose(k: Floats, rig: Rig) -> TrueStep:
+def previous_pose(k: Floats, simulated: SimulatedBench) -> TrueStep:
     """Memory of the previous pose: k sin of the innermost angle of the dwell before; zero in the first dwell."""
-    sines = np.concatenate([[0.0], np.sin(rig.motion.angles_rad[:-1, -1])])
+    sines = np.concatenate([[0.0], np.sin(simulated.motion.angles_rad[:-1, -1])])
     return adding(lambda state: k * sines[state.dwell])
 
 
 @_made("cable-torque", *_BIAS, driver="angle", family=NO_FAMILY)
-def cable_torque(k: Floats, rig: Rig) -> TrueStep:
+def cable_torque(k: Floats, simulated: SimulatedBench) -> TrueStep:
     """Torque of a wound-up cable: k times the square of the innermost angle, as it was commanded, in half turns."""
     return adding(lambda state: k * (state.angles_rad[:, -1:] / np.pi) ** 2)
 
@@ -131,43 +131,45 @@ def double_warm_up(
 
 
 @_made("creep-and-walk", "m/s^2", ("5ug", "100ug"), ("1mg", "10mg"), driver="time", family="bias in time")
-def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3) -> TrueStep:
+def creep_and_walk(k: Floats, simulated: SimulatedBench, *, tau: float = 60.0, share: float = 0.3) -> TrueStep:
     """Creep of the bias after power-on, then a random walk: k (ln(1 + t / tau) + share W), W a random walk whose
     variance is t / tau; the creep is the faster at first, the walk later on."""
-    walk = FirstOrder(rig.generator("creep-and-walk"), 1.0, math.sqrt(rig.period_s / tau), 0.0)
+    walk = FirstOrder(simulated.generator("creep-and-walk"), 1.0, math.sqrt(simulated.period_s / tau), 0.0)
     return adding(lambda state: k * (np.log1p(column(state.time_s) / tau) + share * walk(len(state.time_s))))
 
 
 @_made("output-step", *_BIAS, coefficients=("step",), driver="time",
       family="bias in time")  # fmt: skip
-def output_step(size: Floats, rig: Rig) -> TrueStep:
+def output_step(size: Floats, simulated: SimulatedBench) -> TrueStep:
     """Step of one accelerometer's output: constant from an instant on; which one, and when between a fifth and four
     fifths of the run, is drawn from the seed."""
-    rng = rig.generator("output-step")
-    steps, start_s = size * np.eye(3)[rng.integers(3)], rng.uniform(0.2, 0.8) * rig.duration_s
+    rng = simulated.generator("output-step")
+    steps, start_s = size * np.eye(3)[rng.integers(3)], rng.uniform(0.2, 0.8) * simulated.duration_s
     return adding(lambda state: steps * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
 @_made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
       signed=False, driver="specific force", family="unstated noise")  # fmt: skip
-def loose_mount(play: Floats, rig: Rig) -> TrueStep:
+def loose_mount(play: Floats, simulated: SimulatedBench) -> TrueStep:
     """Loose mount: in each dwell the platform is turned in itself by play_j clip(u_k + z, -1, 1) about axis j, u_k
     the part of gravity's direction along the axis that follows j, z a standard normal number, the friction: it rests
     between two stops, mostly near the one that gravity pulls it to."""
-    angles_rad, count = rig.motion.angles_rad, len(rig.motion.angles_rad)
-    upward = carried_by_earth(rig.bench, np.array([[0.0, 1.0, 0.0]]), np.multiply(rig.motion.arrive_ns, 1e-9))
-    pull = rotate(attitude(rig.axes, angles_rad, rig.bench.up).inv(), upward)[:, [1, 2, 0]]
-    friction = rig.generator("loose-mount").standard_normal((count, 3))
+    angles_rad, count = simulated.motion.angles_rad, len(simulated.motion.angles_rad)
+    upward = carried_by_earth(
+        simulated.bench, np.array([[0.0, 1.0, 0.0]]), np.multiply(simulated.motion.arrive_ns, 1e-9)
+    )
+    pull = rotate(attitude(simulated.axes, angles_rad, simulated.bench.up).inv(), upward)[:, [1, 2, 0]]
+    friction = simulated.generator("loose-mount").standard_normal((count, 3))
     turns_rad = play * np.clip(pull + friction, -1.0, 1.0)
     return turning_platform(lambda state: state.of_dwells(turns_rad))
 
 
 @_made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),
       per_axis=True, driver="angle", family="gimbal and encoder")  # fmt: skip
-def eccentric_bearing(size: Floats, rig: Rig, axis: int, *, share: float = 1.0) -> TrueStep:
+def eccentric_bearing(size: Floats, simulated: SimulatedBench, axis: int, *, share: float = 1.0) -> TrueStep:
     """Eccentric bearing of a gimbal: its encoder errs by s sin q + c cos q, and its axis is tilted in its parent by
     share s and share c, as with encoder-harmonic-1 and axis-nonorthogonality, because its shaft is off its centre."""
-    parts = harmonic(1)(size, rig, axis), axis_nonorthogonality(share * size, rig, axis)
+    parts = harmonic(1)(size, simulated, axis), axis_nonorthogonality(share * size, simulated, axis)
 
     def step(state: TrueState) -> None:
         for part in parts:

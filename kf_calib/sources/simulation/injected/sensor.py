@@ -13,7 +13,7 @@ from itertools import accumulate
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, sign
-from kf_calib.sources.simulation.injected.kinds import Rig, above, added, column, made, output, pendulous
+from kf_calib.sources.simulation.injected.kinds import SimulatedBench, above, added, column, made, output, pendulous
 from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias, adding, putting
 from kf_calib.sources.simulation.sensors import FirstOrder
 
@@ -24,7 +24,7 @@ _PENDULOUS_AND_OUTPUT = ("1p", "1o", "2p", "2o", "3p", "3o")
     "thermal-misalignment", "rad/K", ("0.1urad/K", "10urad/K"), ("10urad/K", "100urad/K"),
     stage="input", coefficients=_PENDULOUS_AND_OUTPUT,
 )  # fmt: skip
-def thermal_misalignment(gamma: Floats, rig: Rig, *, reference: float = 25.0) -> TrueStep:
+def thermal_misalignment(gamma: Floats, simulated: SimulatedBench, *, reference: float = 25.0) -> TrueStep:
     """Thermal misalignment: the input axis leans to (1, gamma_p T, gamma_o T), a_i + gamma_p T a_p + gamma_o T a_o."""
     to_pendulous, to_output = gamma[0::2], gamma[1::2]
 
@@ -60,14 +60,16 @@ def thermal_rate(k: Floats, state: TrueState) -> Floats:
 
 
 @made("thermal-lag", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"))
-def thermal_lag(alpha: Floats, rig: Rig, *, tau: float = 600.0, reference: float = 25.0) -> TrueStep:
+def thermal_lag(alpha: Floats, simulated: SimulatedBench, *, tau: float = 600.0, reference: float = 25.0) -> TrueStep:
     """Thermal lag: alpha L, where tau dL/dt = T - L, the sensor follows the thermometer; L = T at the first sample."""
-    lag = Lag(rig.period_s, tau)
+    lag = Lag(simulated.period_s, tau)
     return adding(lambda state: alpha * column(lag(state.temperature_c - reference)))
 
 
 @made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"))
-def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
+def thermal_hysteresis(
+    alpha: Floats, simulated: SimulatedBench, *, play: float = 2.0, reference: float = 25.0
+) -> TrueStep:
     """Thermal hysteresis: alpha times a temperature that follows the true one with a play of so
     many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
     followed_c: float | None = None
@@ -105,7 +107,7 @@ class Lag:
 
 
 @made("dead-zone", "m/s^2", ("1ug", "5ug"), ("0.1mg", "1mg"), stage="input", signed=False)
-def dead_zone(d: Floats, rig: Rig) -> TrueStep:
+def dead_zone(d: Floats, simulated: SimulatedBench) -> TrueStep:
     """Dead zone: no response, -a_i, where |a_i| < d (IEEE Std 528, dead band without hysteresis)."""
     return putting("input_mps2", lambda state: np.where(np.abs(state.input_mps2) < d, 0.0, state.input_mps2))
 
@@ -202,13 +204,15 @@ def sinusoid(k: Floats, state: TrueState, *, frequency: float = 0.15, phase: flo
 
 
 @made("bias-walk", "m/s^2/s^(1/2)", ("0.01ug", "1ug"), ("1ug", "100ug"), signed=False)
-def bias_walk(q: Floats, rig: Rig) -> TrueStep:
+def bias_walk(q: Floats, simulated: SimulatedBench) -> TrueStep:
     """Random walk of the bias: q times the integral of white noise, q sqrt(t) after a time t (IEEE Std 952, K)."""
-    walk = FirstOrder(rig.generator("bias-walk"), 1.0, math.sqrt(rig.period_s), 0.0)
+    walk = FirstOrder(simulated.generator("bias-walk"), 1.0, math.sqrt(simulated.period_s), 0.0)
     return WalkingBias(lambda count: q * walk(count))
 
 
-def _vibration_rectification(k: Floats, rig: Rig, *, rms: float, frequency: float, period: float) -> TrueStep:
+def _vibration_rectification(
+    k: Floats, simulated: SimulatedBench, *, rms: float, frequency: float, period: float
+) -> TrueStep:
     """K2 <v^2> of the vibration below, the mean over its cycles."""
     return adding(lambda state: k * (rms * np.sin(np.pi * column(state.time_s) / period) ** 2) ** 2)
 
@@ -221,11 +225,11 @@ def _vibration_rectification(k: Floats, rig: Rig, *, rms: float, frequency: floa
     counted=_vibration_rectification,
 )
 def vibration_rectification(
-    k: Floats, rig: Rig, *, rms: float = 3.0, frequency: float = 33.7, period: float = 170.0
+    k: Floats, simulated: SimulatedBench, *, rms: float = 3.0, frequency: float = 33.7, period: float = 170.0
 ) -> TrueStep:
     """Vibration rectification: vibration v adds v + K2 v^2, so K2 <v^2>; v is a sinusoid of each accelerometer's own
     phase, in the readings too, whose effective value rises and falls as rms sin^2(pi t / period) (IEEE Std 1293)."""
-    phases = rig.generator("vibration-rectification").uniform(0.0, 2.0 * np.pi, 3)
+    phases = simulated.generator("vibration-rectification").uniform(0.0, 2.0 * np.pi, 3)
 
     def vibrating(state: TrueState) -> Floats:
         t = column(state.time_s)
@@ -260,7 +264,7 @@ class LastStep:
 
 
 @made("settling", "1", ("1ug/g", "30ug/g"), ("0.1mg/g", "3mg/g"))
-def settling(c: Floats, rig: Rig, *, tau: float = 60.0) -> TrueStep:
+def settling(c: Floats, simulated: SimulatedBench, *, tau: float = 60.0) -> TrueStep:
     """Settling: C Delta a_i exp(-time since arrival / tau), creep of the suspension after the last step Delta a_i;
     on the way to the next dwell C times the change so far (IEEE Std 1293, settling time; anelastic relaxation)."""
     last = LastStep()
@@ -273,9 +277,9 @@ def settling(c: Floats, rig: Rig, *, tau: float = 60.0) -> TrueStep:
 
 
 @made("memory", "1", ("1ug/g", "100ug/g"), ("0.1mg/g", "3mg/g"))
-def memory(c: Floats, rig: Rig, *, tau: float = 100.0) -> TrueStep:
+def memory(c: Floats, simulated: SimulatedBench, *, tau: float = 100.0) -> TrueStep:
     """Memory: c (a_i - x), where tau dx/dt = a_i - x, relaxation over several dwells; x = a_i at the first sample."""
-    lags = [Lag(rig.period_s, tau) for _ in range(3)]
+    lags = [Lag(simulated.period_s, tau) for _ in range(3)]
 
     def contribution(state: TrueState) -> Floats:
         inputs = np.broadcast_to(state.input_mps2, (len(state.time_s), 3))
@@ -285,7 +289,7 @@ def memory(c: Floats, rig: Rig, *, tau: float = 100.0) -> TrueStep:
 
 
 @made("hysteresis", "m/s^2", ("1ug", "20ug"), ("0.1mg", "2mg"))
-def hysteresis(h: Floats, rig: Rig, *, threshold: float = 1e-3) -> TrueStep:
+def hysteresis(h: Floats, simulated: SimulatedBench, *, threshold: float = 1e-3) -> TrueStep:
     """Hysteresis: h sgn Delta a_i, the last step; none for steps below the threshold (IEEE Std 1293, hysteresis)."""
     last = LastStep()
     return adding(lambda state: h * sign(last(state), threshold))
