@@ -40,11 +40,14 @@ from kf_calib.support.text import cut
 
 WANTED = "a header such as time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c is wanted"
 """How columns have to be named."""
+SLOWEST_S = 1.0
+"""Rows that are closer are samples, not dwells."""
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
 READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
+_FEWEST_SAMPLES = 50
 _NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
 """What people write where there is no temperature."""
 _TIME_ALONE = ("t", "x_value")
@@ -178,9 +181,10 @@ class Columns:
     # -- what kind of text it is --
 
     @property
-    def marks_of_a_table(self) -> bool:
-        """Whether there is what only a table of dwells has: numbers of readings, deviations, faces."""
-        return any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
+    def may_be_samples(self) -> bool:
+        """Whether rows are many, and there is nothing of what only a table of dwells has: numbers of readings,
+        deviations, faces."""
+        return len(self.rows) > _FEWEST_SAMPLES and not any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
 
     @property
     def orientation(self) -> str:
@@ -224,10 +228,15 @@ class Columns:
         """How stamps in a column are written, of which the next of ``places`` may have the time of day; None where this
         or their unit is not told."""
         first = next((row[place] for row in self.rows if row[place]), "0")
-        if not self.meanings[place].unit and math.isnan(self.numbers.value(first)):
-            return self._dates(places[:2] if place == places[0] else [place])
-        unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
-        return Stamps((place,), (round(TIME[unit] * 1e9),)) if unit else None
+        if self.meanings[place].unit or not math.isnan(self.numbers.value(first)):
+            unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
+            return Stamps((place,), (round(TIME[unit] * 1e9),)) if unit else None
+        both = places[:2] if place == places[0] else [place]
+        rows = [[row[at] for at in both] for row in self.rows if all(row[at] for at in both)]
+        for count in (len(both), 1):
+            with suppress(ValueError):
+                return Stamps.of_dates(both[:count], [" ".join(cells[:count]) for cells in rows])
+        return None
 
     def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
         """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
@@ -285,14 +294,6 @@ class Columns:
             f"'{name}=time_ms', or give the rate of the rows by --rate; {WANTED}, not {self._all}."
         )
 
-    def _dates(self, places: Sequence[int]) -> Stamps | None:
-        """How stamps of a calendar are written; of two columns the second may give the time of day."""
-        rows = [[row[at] for at in places] for row in self.rows if all(row[at] for at in places)]
-        for count in (len(places), 1):
-            with suppress(ValueError):
-                return Stamps.of_dates(places[:count], [" ".join(cells[:count]) for cells in rows])
-        return None
-
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
 
@@ -300,13 +301,12 @@ class Columns:
         places, units = self.reading_places, self.units
         by_name = [self.meanings[at].unit for at in places]
         named, values = units.told_by([self.header[at] for at in places], by_name), self.values(places)
-        norm = usual_norm(values)
-        if "" in named and not (units.accel or units.as_default(named, norm)) and math.isnan(norm):
+        raw, words, by_size = reading_units(named, values, units)
+        if by_size and not np.isfinite(values).all(axis=1).any():
             raise InputError(
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        raw, words, by_size = reading_units(named, values, units)
         self.by_size |= {at: by_size for at, unit in zip(places, named, strict=True) if by_size and not unit}
         if raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))

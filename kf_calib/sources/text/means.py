@@ -24,7 +24,7 @@ from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.cells import LineError, QuantityColumns
-from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
+from kf_calib.sources.text.columns import HOW, READINGS, SLOWEST_S, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
 from kf_calib.sources.text.reader import named
@@ -32,7 +32,6 @@ from kf_calib.sources.text.units import Units, celsius, reading_units
 from kf_calib.support.text import counted, cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_SAMPLES, _FAST_S = 50, 1.0
 _USUAL_PAUSE_S = 60.0
 _SHOWN = 6  # rows in a message
 _UNKNOWN = (0.0, 0.0, 0.0, 1.0)
@@ -177,10 +176,10 @@ class TableOfMeans:
 
     def refuse_samples(self) -> None:
         """Raise InputError for a time series."""
-        if self.columns.marks_of_a_table or len(self.rows) <= _SAMPLES:
+        if not self.columns.may_be_samples:
             return
         step_s = float(np.median(np.diff(self.times[0])))
-        if step_s < _FAST_S:
+        if step_s < SLOWEST_S:
             raise InputError(
                 f"its {len(self.rows)} rows are samples, {step_s:.3g} s apart, and no table with a row a dwell: "
                 "evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
