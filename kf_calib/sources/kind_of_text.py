@@ -13,10 +13,11 @@ from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
-from kf_calib.sources.text.columns import READINGS, SLOWEST_S, Columns
+from kf_calib.sources.text.columns import SLOWEST_S, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.names import READINGS
 from kf_calib.sources.text.reader import first_line, is_json
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format

@@ -111,7 +111,8 @@ def _decimal_of(cell: str) -> str:
 
 @dataclass(frozen=True)
 class QuantityColumns:
-    """Where a quantity stands in a row, the factors that bring it to our units, and texts that stand for no value."""
+    """Where a quantity stands in a row, the factors that bring it to our units, none where it is in them, and texts
+    that stand for no value."""
 
     at: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
@@ -131,7 +132,7 @@ class QuantityColumns:
             for at, cell, value in zip(self.at, cells, values, strict=True):
                 if not math.isfinite(value):
                     raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
-        return list(map(mul, values, self.factors))
+        return list(map(mul, values, self.factors)) if self.factors else values
 
 
 def number_of(text: str) -> float:

@@ -25,6 +25,8 @@ from kf_calib.sources.text.names import (
     ANGLE,
     NAMELESS,
     QUATERNION,
+    READINGS,
+    SPREADS,
     TIME,
     Meaning,
     face_of,
@@ -44,12 +46,11 @@ SLOWEST_S = 1.0
 """Rows that are closer are samples, not dwells."""
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
-READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 _FEWEST_SAMPLES = 50
-_NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
-"""What people write where there is no temperature."""
+NOTHING = frozenset(("", "-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
+"""What people write where there is no value."""
 _TIME_ALONE = ("t", "x_value")
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
 """Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
@@ -203,8 +204,7 @@ class Columns:
         if self.units.rate_hz is not None:
             self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
             return Stamps((), (), rate_hz=self.units.rate_hz)
-        nothing = {"", *_NOTHING}
-        filled = [at for at in self.places("time") if any(row[at].lower() not in nothing for row in self.rows)]
+        filled = [at for at in self.places("time") if any(row[at].lower() not in NOTHING for row in self.rows)]
         places = filled if self.rows else self.places("time")
         if not places:
             raise InputError(
@@ -326,7 +326,7 @@ class Columns:
             self.without_unit = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         else:
             self.written_mps2 = self.raw.factors.tolist()
-        return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
+        return QuantityColumns(tuple(places))
 
     @property
     def reading_places(self) -> list[int]:
@@ -346,8 +346,7 @@ class Columns:
         """The attitude, or the angles by the usual names, else every column of an angle in the order of the header;
         none where there is none. Raises InputError where they or their unit are not told and they are needed."""
         if self.orientation == "attitude":
-            known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
-            return QuantityColumns(known, (1.0,) * 4)
+            return QuantityColumns(tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None))
         places, stated, how = self.angles, self.units.angle, ""
         ranks, units = [self.meanings[at].rank for at in places], [self.meanings[at].unit for at in places]
         if any(ranks) and len(set(ranks)) < len(ranks):
@@ -399,7 +398,7 @@ class Columns:
             return QuantityColumns(), "c"
         if self.is_table or not is_exact(self.names[at]):
             self.said.append(f"temperature from {self.named([at])} in {(self.meanings[at].unit or 'c').upper()}")
-        return QuantityColumns((at,), (1.0,), _NOTHING), self.meanings[at].unit or "c"
+        return QuantityColumns((at,), absent=NOTHING), self.meanings[at].unit or "c"
 
     # -- what names do not tell --
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from kf_calib.sources.text.cells import are_stamps
-from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
+from kf_calib.sources.text.names import NAMELESS, READINGS, face_of, is_unit, meanings_of
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -269,7 +269,7 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
 
 def _tell_readings(names: Sequence[str]) -> bool:
     """Return whether names are those of columns with three readings."""
-    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= {"ax", "ay", "az"}
+    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= set(READINGS)
 
 
 def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:

@@ -26,6 +26,7 @@ ACCEL = {
 ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 TEMPERATURE = ("c", "k", "f")
+READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 QUATERNION = ("qx", "qy", "qz", "qw")
 _SHORTEST_TIME = 2
 """Letters of a unit that is the name of a time; a shorter one may be a letter for something else."""
@@ -148,7 +149,7 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
         (is_exact(name), not own & _KINDS["lesser"], bool(own & _KINDS["force"]))
         for own, name in zip(words, names, strict=True)
     ]
-    for ours in ("ax", "ay", "az"):
+    for ours in READINGS:
         places = [k for k, own in enumerate(meanings) if own.ours == ours]
         best = max((strengths[k] for k in places), default=None)
         for k in places:
