@@ -121,10 +121,10 @@ class QuantityColumns:
     def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
         cells = [row[at] for at in self.at]
-        if not all(cells):
-            if any(cells):
-                raise LineError("some components of a vector are missing")
+        if not any(cells):
             return None
+        if not all(cells):
+            raise LineError("some components of a vector are missing")
         values = numbers.values(cells)
         if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
             if cells[0].lower() in self.absent:
@@ -175,15 +175,13 @@ class Stamps:
         """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
         if self.rate_hz is not None:
             return round(number * 1e9 / self.rate_hz)
-        begin, parts = len(self.at) - len(self.units_ns), self.at
-        cell = row[parts[0]] if len(parts) == 1 else " ".join(row[at] for at in parts[: begin or None])
+        dated = self.at[: len(self.at) - len(self.units_ns)]
+        cell = " ".join([row[at] for at in dated or self.at])
         try:
-            since_ns = 0
-            if self.units_ns:
-                counted = zip(parts[begin:], self.units_ns, strict=True)
-                since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
-                if not begin:
-                    return since_ns
+            counted = zip(self.at[len(dated) :], self.units_ns, strict=True)
+            since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
+            if not dated:
+                return since_ns
             stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST

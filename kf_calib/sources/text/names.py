@@ -242,9 +242,14 @@ _MOSTLY = 0.9  # of the steps of a time go up, and of sizes are counted
 _LIKE, _CLOSE = 2.0, 0.01
 
 
+def nameless(count: int) -> list[str]:
+    """The names of so many columns that have none."""
+    return [NAMELESS.format(k + 1) for k in range(count)]
+
+
 def is_nameless(header: Sequence[str]) -> bool:
     """Whether columns have no names but their numbers."""
-    return bool(header) and all(name == NAMELESS.format(k + 1) for k, name in enumerate(header))
+    return bool(header) and list(header) == nameless(len(header))
 
 
 def meanings_by_numbers(values: Floats) -> list[Meaning]:
