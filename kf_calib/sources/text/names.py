@@ -16,12 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.raw_input import UNITS
 from kf_calib.support.units import WORDS
 
-ACCEL = {
-    "m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "cm/s2": 1e-2,
-    "ft/s2": 0.3048, "in/s2": 0.0254, "count": 1.0,
-}  # fmt: skip
+ACCEL = {**UNITS, "mm/s2": 1e-3, "cm/s2": 1e-2, "ft/s2": 0.3048, "in/s2": 0.0254, "count": 1.0}
 """Units of readings in m/s^2; counts as they are."""
 ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -39,7 +37,7 @@ def _plain(text: str) -> str:
 
 
 _VOCABULARY = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
-_UNITS = {word: unit for unit, words in _VOCABULARY["units"].items() for word in words.split()}
+_UNIT_OF_WORD = {word: unit for unit, words in _VOCABULARY["units"].items() for word in words.split()}
 _KINDS = {kind: frozenset(_plain(words).split()) for kind, words in _VOCABULARY["kinds"].items()}
 _READING = _KINDS["reading"] | _KINDS["force"]
 _PREFIXES = _READING | _KINDS["spread"] | {"s", "grav"}
@@ -202,7 +200,7 @@ def face_of(text: str) -> tuple[int, int] | None:
 def _unit_named(text: str) -> str:
     """Return the unit that a text is; empty where it is none."""
     plain = unicodedata.normalize("NFKC", text.replace("º", "°")).lower().replace("\u2212", "-")
-    return _UNITS.get(re.sub(r"[\s^*·⋅._()\[\]]", "", plain), "")
+    return _UNIT_OF_WORD.get(re.sub(r"[\s^*·⋅._()\[\]]", "", plain), "")
 
 
 def _unit_of(name: str) -> tuple[str, str]:
