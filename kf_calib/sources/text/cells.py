@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from operator import mul
 
+from kf_calib.sources.text.names import VOCABULARY
 from kf_calib.support.text import cut, number_from
 
 CsvRow = Sequence[str]
@@ -23,8 +24,7 @@ _LOCAL = re.compile(
 )
 _CLOCK = re.compile(r"(?:(\d+) days? )?(?:(\d{1,3}):)?(\d{1,2}):(\d{2})(?:[.,:](\d{1,6})\d*)?")
 _MONTH = re.compile(r"(?<=\d)[-/. ]+([^\W\d]{3})[^\W\d]*[-/. ,]+(?=\d)")
-_NAMES_OF_MONTHS = "janfebmaraprmayjunjulaugsepoctnovdecjanfebmäraprmaijunjulaugsepoktnovdez"
-_MONTHS = {name: k % 12 + 1 for k, name in enumerate(re.findall("...", _NAMES_OF_MONTHS))}
+_MONTHS = {name: k for k, names in enumerate(VOCABULARY["months"], 1) for name in names.split()}
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -28,6 +28,7 @@ from kf_calib.sources.text.names import (
     READINGS,
     SPREADS,
     TIME,
+    VOCABULARY,
     Meaning,
     face_of,
     is_exact,
@@ -49,7 +50,7 @@ KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg),
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 _FEWEST_SAMPLES = 50
-NOTHING = frozenset(("", "-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
+NOTHING = frozenset(("", *VOCABULARY["nothing"].split()))
 """What people write where there is no value."""
 _TIME_ALONE = ("t", "x_value")
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))

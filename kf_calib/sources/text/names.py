@@ -36,9 +36,10 @@ def _plain(text: str) -> str:
     return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
 
 
-_VOCABULARY = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
-_UNIT_OF_WORD = {word: unit for unit, words in _VOCABULARY["units"].items() for word in words.split()}
-_KINDS = {kind: frozenset(_plain(words).split()) for kind, words in _VOCABULARY["kinds"].items()}
+VOCABULARY = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
+"""The words that tell what is in a text."""
+_UNIT_OF_WORD = {word: unit for unit, words in VOCABULARY["units"].items() for word in words.split()}
+_KINDS = {kind: frozenset(_plain(words).split()) for kind, words in VOCABULARY["kinds"].items()}
 _READING = _KINDS["reading"] | _KINDS["force"]
 _PREFIXES = _READING | _KINDS["spread"] | {"s", "grav"}
 _CHANNELS = frozenset("xyz123ху")
