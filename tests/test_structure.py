@@ -189,7 +189,7 @@ CEILINGS = {
     "support": 1071,
     "bench": 1706,
     "effects": 3129,
-    "sources": 11948,
+    "sources": 11873,
     "dwells": 3810,
     "noise": 3405,
     "estimation": 7894,

@@ -13,16 +13,14 @@ from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
-from kf_calib.sources.text.columns import READINGS, Columns
+from kf_calib.sources.text.columns import SLOWEST_S, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.names import READINGS
 from kf_calib.sources.text.reader import first_line, is_json
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
-_FEWEST_SAMPLES = 50
-_SLOWEST_S = 1.0
-"""Rows that are closer are samples, not dwells."""
 _MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.5
 
 
@@ -57,13 +55,13 @@ def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
         columns = Columns(TextHeading.of(lines), stated)
     except InputError:
         return False
-    if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:
+    if not columns.may_be_samples:
         return False
     try:
         steps_ns = np.abs(np.diff(columns.stamps_ns(columns.time())))
     except InputError:
         return _are_alike(columns)
-    return bool(len(steps_ns)) and float(np.median(steps_ns)) < 1e9 * _SLOWEST_S
+    return bool(len(steps_ns)) and float(np.median(steps_ns)) < 1e9 * SLOWEST_S
 
 
 def _are_alike(columns: Columns) -> bool:

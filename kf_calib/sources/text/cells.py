@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from operator import mul
 
+from kf_calib.sources.text.names import VOCABULARY
 from kf_calib.support.text import cut, number_from
 
 CsvRow = Sequence[str]
@@ -23,8 +24,7 @@ _LOCAL = re.compile(
 )
 _CLOCK = re.compile(r"(?:(\d+) days? )?(?:(\d{1,3}):)?(\d{1,2}):(\d{2})(?:[.,:](\d{1,6})\d*)?")
 _MONTH = re.compile(r"(?<=\d)[-/. ]+([^\W\d]{3})[^\W\d]*[-/. ,]+(?=\d)")
-_NAMES_OF_MONTHS = "janfebmaraprmayjunjulaugsepoctnovdecjanfebmäraprmaijunjulaugsepoktnovdez"
-_MONTHS = {name: k % 12 + 1 for k, name in enumerate(re.findall("...", _NAMES_OF_MONTHS))}
+_MONTHS = {name: k for k, names in enumerate(VOCABULARY["months"], 1) for name in names.split()}
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -111,7 +111,8 @@ def _decimal_of(cell: str) -> str:
 
 @dataclass(frozen=True)
 class QuantityColumns:
-    """Where a quantity stands in a row, the factors that bring it to our units, and texts that stand for no value."""
+    """Where a quantity stands in a row, the factors that bring it to our units, none where it is in them, and texts
+    that stand for no value."""
 
     at: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
@@ -120,10 +121,10 @@ class QuantityColumns:
     def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
         cells = [row[at] for at in self.at]
-        if not all(cells):
-            if any(cells):
-                raise LineError("some components of a vector are missing")
+        if not any(cells):
             return None
+        if not all(cells):
+            raise LineError("some components of a vector are missing")
         values = numbers.values(cells)
         if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
             if cells[0].lower() in self.absent:
@@ -131,7 +132,7 @@ class QuantityColumns:
             for at, cell, value in zip(self.at, cells, values, strict=True):
                 if not math.isfinite(value):
                     raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
-        return list(map(mul, values, self.factors))
+        return list(map(mul, values, self.factors)) if self.factors else values
 
 
 def number_of(text: str) -> float:
@@ -174,15 +175,13 @@ class Stamps:
         """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
         if self.rate_hz is not None:
             return round(number * 1e9 / self.rate_hz)
-        begin, parts = len(self.at) - len(self.units_ns), self.at
-        cell = row[parts[0]] if len(parts) == 1 else " ".join(row[at] for at in parts[: begin or None])
+        dated = self.at[: len(self.at) - len(self.units_ns)]
+        cell = " ".join([row[at] for at in dated or self.at])
         try:
-            since_ns = 0
-            if self.units_ns:
-                counted = zip(parts[begin:], self.units_ns, strict=True)
-                since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
-                if not begin:
-                    return since_ns
+            counted = zip(self.at[len(dated) :], self.units_ns, strict=True)
+            since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
+            if not dated:
+                return since_ns
             stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST

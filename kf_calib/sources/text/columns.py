@@ -18,35 +18,23 @@ from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import OPTIONS, PLAIN
 from kf_calib.errors import CountsError, InputError
+from kf_calib.sources.text import names
 from kf_calib.sources.text.cells import DECIMAL_POINT, CsvRow, LineError, Numbers, QuantityColumns, Stamps, are_stamps
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.names import (
-    ACCEL,
-    ANGLE,
-    NAMELESS,
-    QUATERNION,
-    TIME,
-    Meaning,
-    face_of,
-    is_exact,
-    is_nameless,
-    meaning_of,
-    meanings_by_numbers,
-    meanings_of,
-    unit_of_epoch,
-)
 from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 
 WANTED = "a header such as time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c is wanted"
 """How columns have to be named."""
+SLOWEST_S = 1.0
+"""Rows that are closer are samples, not dwells."""
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
-READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
-_OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
-_MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
-_NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
-"""What people write where there is no temperature."""
+_OPTIONAL = ("time", "count", "temperature", "sd", *names.SPREADS)
+_MARKS_OF_TABLES = ("count", "face", "sd", *names.SPREADS)
+_FEWEST_SAMPLES = 50
+NOTHING = frozenset(("", *names.VOCABULARY["nothing"].split()))
+"""What people write where there is no value."""
 _TIME_ALONE = ("t", "x_value")
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
 """Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
@@ -80,13 +68,13 @@ class Columns:
         self.rows: list[CsvRow] = [row for row in heading.rows if len(row) == len(self.names)]
         if self.units.where:
             self._choose_rows(self.units.where)
-        self.meanings = meanings_of(self.header, stated)
+        self.meanings = names.meanings_of(self.header, stated)
         self.numbers = self.numbers_in(self.rows) or DECIMAL_POINT
         for k in self.places("count"):
             counts = self.values([k])[:, 0]
             if len(counts) > 1 and ((np.diff(counts) == 1.0).mean() > _MOST_CELLS or counts.max() < _FEWEST):
-                self.meanings[k] = Meaning()  # the number of the row
-        if is_nameless(self.header) and not stated:
+                self.meanings[k] = names.Meaning()  # the number of the row
+        if names.is_nameless(self.header) and not stated:
             self._recognise_numbers()
         if is_table:
             self._recognise_contents({k for k, name in enumerate(self.header) if name in stated})
@@ -117,11 +105,11 @@ class Columns:
         """The column of a quantity that is there once; names of the format go before others. Raises InputError where
         two are left."""
         places = self.places(ours)
-        places = [at for at in places if is_exact(self.names[at])] or places
+        places = [at for at in places if names.is_exact(self.names[at])] or places
         if len(places) > 1:
             if len({self.names[at].lower() for at in places}) == 1:
                 raise InputError(f"two columns are named {self.names[places[0]]!r}: rename or remove one of them.")
-            kinds = READINGS if ours in READINGS and self.has(*READINGS) else (ours,)
+            kinds = names.READINGS if ours in names.READINGS and self.has(*names.READINGS) else (ours,)
             example = " ".join(f"--column {f'{self.header[self.places(kind)[0]]}={kind}'!r}" for kind in kinds)
             raise InputError(
                 f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by {example}."
@@ -178,9 +166,10 @@ class Columns:
     # -- what kind of text it is --
 
     @property
-    def marks_of_a_table(self) -> bool:
-        """Whether there is what only a table of dwells has: numbers of readings, deviations, faces."""
-        return any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
+    def may_be_samples(self) -> bool:
+        """Whether rows are many, and there is nothing of what only a table of dwells has: numbers of readings,
+        deviations, faces."""
+        return len(self.rows) > _FEWEST_SAMPLES and not any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
 
     @property
     def orientation(self) -> str:
@@ -190,7 +179,7 @@ class Columns:
         if self.is_table and self.has("face"):
             return "face"
         are_usual = any(own.ours == "angle" and (own.rank or own.unit) for own in self.meanings)
-        return "attitude" if self.has(*QUATERNION) and not are_usual else "angles" if self.has("angle") else ""
+        return "attitude" if self.has(*names.QUATERNION) and not are_usual else "angles" if self.has("angle") else ""
 
     # -- quantities --
 
@@ -199,15 +188,14 @@ class Columns:
         if self.units.rate_hz is not None:
             self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
             return Stamps((), (), rate_hz=self.units.rate_hz)
-        nothing = {"", *_NOTHING}
-        filled = [at for at in self.places("time") if any(row[at].lower() not in nothing for row in self.rows)]
+        filled = [at for at in self.places("time") if any(row[at].lower() not in NOTHING for row in self.rows)]
         places = filled if self.rows else self.places("time")
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
                 f"--rate 100; {WANTED}, not {self._all}."
             )
-        exact = [at for at in places if is_exact(self.names[at])]
+        exact = [at for at in places if names.is_exact(self.names[at])]
         ways = [way for at in exact or places if (way := self._stamps_in(at, places))]
         if parts := self._parts_of_time(ways):
             ways.append(parts)
@@ -216,18 +204,24 @@ class Columns:
         stamps = min(ways, key=self._unevenness) if len(ways) > 1 else ways[0]
         if self.is_table or not exact:
             zone = " (UTC, since no time zone is named)" * (self.is_table and not (stamps.units_ns or stamps.has_zone))
-            unit = f" in {' and '.join(name for ns in stamps.units_ns for name, s in TIME.items() if ns == s * 1e9)}"
-            self.said.append(f"time from {self.named(stamps.at)}{unit * bool(stamps.units_ns)}{zone}")
+            units = [name for ns in stamps.units_ns for name, s in names.TIME.items() if ns == s * 1e9]
+            unit = f" in {' and '.join(units)}" * bool(units)
+            self.said.append(f"time from {self.named(stamps.at)}{unit}{zone}")
         return stamps
 
     def _stamps_in(self, place: int, places: Sequence[int]) -> Stamps | None:
         """How stamps in a column are written, of which the next of ``places`` may have the time of day; None where this
         or their unit is not told."""
         first = next((row[place] for row in self.rows if row[place]), "0")
-        if not self.meanings[place].unit and math.isnan(self.numbers.value(first)):
-            return self._dates(places[:2] if place == places[0] else [place])
-        unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
-        return Stamps((place,), (round(TIME[unit] * 1e9),)) if unit else None
+        if self.meanings[place].unit or not math.isnan(self.numbers.value(first)):
+            unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
+            return Stamps((place,), (round(names.TIME[unit] * 1e9),)) if unit else None
+        both = places[:2] if place == places[0] else [place]
+        rows = [[row[at] for at in both] for row in self.rows if all(row[at] for at in both)]
+        for count in (len(both), 1):
+            with suppress(ValueError):
+                return Stamps.of_dates(both[:count], [" ".join(cells[:count]) for cells in rows])
+        return None
 
     def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
         """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
@@ -269,7 +263,7 @@ class Columns:
         step = float(np.median(steps)) if len(steps) else 0.0
         if len(steps) and step == 0.0 and steps.max() == 1.0:
             return "s"
-        by_size = unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s" * self.is_table
+        by_size = names.unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s" * self.is_table
         return by_size or next((unit for low, high, unit in _OF_STEPS if low < step < high), "")
 
     def _without_time(self, place: int) -> InputError:
@@ -285,14 +279,6 @@ class Columns:
             f"'{name}=time_ms', or give the rate of the rows by --rate; {WANTED}, not {self._all}."
         )
 
-    def _dates(self, places: Sequence[int]) -> Stamps | None:
-        """How stamps of a calendar are written; of two columns the second may give the time of day."""
-        rows = [[row[at] for at in places] for row in self.rows if all(row[at] for at in places)]
-        for count in (len(places), 1):
-            with suppress(ValueError):
-                return Stamps.of_dates(places[:count], [" ".join(cells[:count]) for cells in rows])
-        return None
-
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
 
@@ -300,13 +286,12 @@ class Columns:
         places, units = self.reading_places, self.units
         by_name = [self.meanings[at].unit for at in places]
         named, values = units.told_by([self.header[at] for at in places], by_name), self.values(places)
-        norm = usual_norm(values)
-        if "" in named and not (units.accel or units.as_default(named, norm)) and math.isnan(norm):
+        raw, words, by_size = reading_units(named, values, units)
+        if by_size and not np.isfinite(values).all(axis=1).any():
             raise InputError(
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        raw, words, by_size = reading_units(named, values, units)
         self.by_size |= {at: by_size for at, unit in zip(places, named, strict=True) if by_size and not unit}
         if raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))
@@ -317,24 +302,24 @@ class Columns:
                 f"{' '.join(f'{OPTIONS[key]} {value}' for key, value in keys.items())}.", keys
             )  # fmt: skip
         is_stated = units.accel is not None or units.accel_scale != 1.0
-        if self.is_table or is_stated or not all(is_exact(self.names[at]) for at in places):
+        if self.is_table or is_stated or not all(names.is_exact(self.names[at]) for at in places):
             self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {words}")
         self.raw = raw
         is_made = units.accel_scale != 1.0 or named != by_name or "count" in named  # the names tell less than is known
         if is_made or self.raw.sizes != PLAIN.sizes or self.raw.counts != SIGNED:
-            self.written_mps2 = [ACCEL.get(unit, 1.0) for unit in by_name]
+            self.written_mps2 = [names.ACCEL.get(unit, 1.0) for unit in by_name]
             self.without_unit = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         else:
             self.written_mps2 = self.raw.factors.tolist()
-        return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
+        return QuantityColumns(tuple(places))
 
     @property
     def reading_places(self) -> list[int]:
         """The columns of the three readings. Raises InputError where one is missing."""
-        places = [at for ours in READINGS if (at := self.place(ours)) is not None]
-        if len(places) == len(READINGS):
+        places = [at for ours in names.READINGS if (at := self.place(ours)) is not None]
+        if len(places) == len(names.READINGS):
             return places
-        missing = [ours for ours in READINGS if not self.has(ours)]
+        missing = [ours for ours in names.READINGS if not self.has(ours)]
         example = f"--column '{self._left_over}={missing[0]}_g'"
         raise InputError(
             f"no column was recognised as the {'mean ' * self.is_table}reading of accelerometer "
@@ -346,8 +331,7 @@ class Columns:
         """The attitude, or the angles by the usual names, else every column of an angle in the order of the header;
         none where there is none. Raises InputError where they or their unit are not told and they are needed."""
         if self.orientation == "attitude":
-            known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
-            return QuantityColumns(known, (1.0,) * 4)
+            return QuantityColumns(tuple(at for ours in names.QUATERNION if (at := self.place(ours)) is not None))
         places, stated, how = self.angles, self.units.angle, ""
         ranks, units = [self.meanings[at].rank for at in places], [self.meanings[at].unit for at in places]
         if any(ranks) and len(set(ranks)) < len(ranks):
@@ -368,10 +352,10 @@ class Columns:
                 raise self.without_angles()
             return QuantityColumns()
         units = [unit or str(stated) for unit in units]
-        if self.is_table or not all(is_exact(self.names[at]) for at in places):
+        if self.is_table or not all(names.is_exact(self.names[at]) for at in places):
             words = " and ".join(dict.fromkeys(units))
             self.said.append(f"gimbal angles, outer to inner, from {self.named(places)} in {words}{how}")
-        return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
+        return QuantityColumns(tuple(places), tuple(names.ANGLE[unit] for unit in units))
 
     @property
     def angles(self) -> list[int]:
@@ -397,16 +381,17 @@ class Columns:
         at = self.place("temperature")
         if at is None:
             return QuantityColumns(), "c"
-        if self.is_table or not is_exact(self.names[at]):
+        if self.is_table or not names.is_exact(self.names[at]):
             self.said.append(f"temperature from {self.named([at])} in {(self.meanings[at].unit or 'c').upper()}")
-        return QuantityColumns((at,), (1.0,), _NOTHING), self.meanings[at].unit or "c"
+        return QuantityColumns((at,), absent=NOTHING), self.meanings[at].unit or "c"
 
     # -- what names do not tell --
 
     def _recognise_numbers(self) -> None:
         """Find time and readings in columns without names."""
         places = [k for k in range(len(self.header)) if self._are_numbers(k)]
-        for place, meaning in zip(places, meanings_by_numbers(self.values(places)) if places else (), strict=True):
+        meanings = names.meanings_by_numbers(self.values(places)) if places else ()
+        for place, meaning in zip(places, meanings, strict=True):
             if meaning.ours:
                 self._guess(place, meaning.ours)
         self.said.append("columns without names are told by their numbers")
@@ -416,19 +401,19 @@ class Columns:
         template has and nobody filled are as if they were not there."""
         for k in set(range(len(self.header))) - stated:
             kind, cells = self.meanings[k].ours, [row[k] for row in self.rows]
-            are_faces = [face_of(cell) is not None for cell in cells]
+            are_faces = [names.face_of(cell) is not None for cell in cells]
             if (kind in _OPTIONAL and not any(cells)) or (kind == "face" and not any(are_faces)):
-                self.meanings[k], kind = Meaning(), ""
+                self.meanings[k], kind = names.Meaning(), ""
             if kind in ("", "angle") and not self.has("face") and all(are_faces):
                 self._guess(k, "face")
             elif kind == "" and not self.has("time") and are_stamps(cells):
                 self._guess(k, "time")
         left = [k for k in self.unknown if k not in stated]
-        numeric = [] if self.places(*READINGS) else [k for k in left if self._are_numbers(k)]
-        norms = lengths(self.values(numeric)) if len(numeric) == len(READINGS) else np.zeros(0)
+        numeric = [] if self.places(*names.READINGS) else [k for k in left if self._are_numbers(k)]
+        norms = lengths(self.values(numeric)) if len(numeric) == len(names.READINGS) else np.zeros(0)
         norms = norms[np.isfinite(norms)]
         if norms.size and 0 < norms.max() < _ALIKE * norms.min():
-            for k, ours in zip(numeric, READINGS, strict=True):
+            for k, ours in zip(numeric, names.READINGS, strict=True):
                 self._guess(k, ours)
 
     def _are_stamps(self, place: int) -> bool:
@@ -436,7 +421,7 @@ class Columns:
         if not (self.rows and self._are_numbers(place)):
             return are_stamps([row[place] for row in self.rows])
         steps = np.diff(self._finite(place))
-        return self.header[place] in ("", NAMELESS.format(place + 1)) and bool(
+        return self.header[place] in ("", names.NAMELESS.format(place + 1)) and bool(
             (steps > 0.0).all() and (steps % 1.0).any()
         )
 
@@ -455,5 +440,5 @@ def refuse_unknown_names(stated: Mapping[str, str], header: Sequence[str]) -> No
         if theirs not in header:
             shown = cut(", ".join(map(repr, header)), 300)
             raise InputError(f"has no column {cut(theirs, 60)!r} (--column), it has {shown}.")
-        if ours != "-" and not meaning_of(ours).ours:
+        if ours != "-" and not names.meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")

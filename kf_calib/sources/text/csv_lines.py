@@ -11,8 +11,9 @@ import numpy as np
 
 from kf_calib.errors import CountsError
 from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, written
-from kf_calib.sources.text.columns import READINGS, WANTED, Columns
+from kf_calib.sources.text.columns import WANTED, Columns
 from kf_calib.sources.text.heading import with_texts, without_empty_end
+from kf_calib.sources.text.names import READINGS
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.sources.text.units import celsius
 from kf_calib.support.text import cut

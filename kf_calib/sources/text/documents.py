@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import json
 import re
-from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Callable
 
 _ARRAY = re.compile(rb"\s*\[\s*\{")
 _BRACE = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\Z)|[{}]', re.DOTALL)
@@ -18,12 +18,16 @@ _FEWEST_LINES = 3
 LONGEST_LINE_BYTES = 1 << 20
 
 
-class Objects(ABC):
+Cut = Callable[[bytes], tuple[list[bytes], bytes]]
+"""The objects that end in a text, and what is left of it behind them."""
+
+
+class Objects:
     """Cuts text, block by block, into objects. One that does not end, or not in a megabyte, is given as it is, for the
     reader of lines to refuse and count."""
 
-    def __init__(self) -> None:
-        self._tail = b""
+    def __init__(self, cut: Cut) -> None:
+        self._cut, self._tail = cut, b""
 
     def push(self, block: bytes) -> bytes:
         """The objects that end in a block of UTF-8, a line each."""
@@ -32,48 +36,41 @@ class Objects(ABC):
             objects, self._tail = [*objects, self._tail], b""
         return b"".join(map(_as_line, objects))
 
-    @abstractmethod
-    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]: ...
-
     def rest(self) -> bytes:
         """A line of what has not ended; none if there is nothing but the end of an array."""
         tail, self._tail = self._tail.strip(b" \t\r\n,]"), b""
         return _as_line(tail) if tail else b""
 
 
-class ArrayOfJson(Objects):
-    """The objects in one array."""
-
-    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]:
-        objects, depth, first, end = list[bytes](), 0, 0, 0
-        for match in _BRACE.finditer(text):
-            if match[0] == b"{":
-                first = first if depth else match.start()
-                depth += 1
-            elif match[0] == b"}" and depth:
-                depth -= 1
-                if not depth:
-                    end = match.end()
-                    objects.append(text[first:end])
-        return objects, text[end:]
+def cut_array(text: bytes) -> tuple[list[bytes], bytes]:
+    """The objects in one array of JSON."""
+    objects, depth, first, end = list[bytes](), 0, 0, 0
+    for match in _BRACE.finditer(text):
+        if match[0] == b"{":
+            first = first if depth else match.start()
+            depth += 1
+        elif match[0] == b"}" and depth:
+            depth -= 1
+            if not depth:
+                end = match.end()
+                objects.append(text[first:end])
+    return objects, text[end:]
 
 
-class EchoedMessages(Objects):
+def cut_echo(text: bytes) -> tuple[list[bytes], bytes]:
     """The documents of YAML between lines of three hyphens."""
-
-    def _cut(self, text: bytes) -> tuple[list[bytes], bytes]:
-        *documents, tail = _BORDER.split(text.decode("utf-8", "surrogateescape"))
-        return [_flat(document) for document in documents if document.strip()], tail.encode("utf-8", "surrogateescape")
+    *documents, tail = _BORDER.split(text.decode("utf-8", "surrogateescape"))
+    return [_flat(document) for document in documents if document.strip()], tail.encode("utf-8", "surrogateescape")
 
 
 def objects_in(head: bytes) -> Objects | None:
     """What cuts a text that begins so into objects; None where its lines are to be read as they are."""
     if _ARRAY.match(head.removeprefix(b"\xef\xbb\xbf")):
-        return ArrayOfJson()
+        return Objects(cut_array)
     documents = _BORDER.split(head.decode("utf-8", "replace").lstrip("\ufeff"))
     lines = next((lines for each in documents[:-1] if (lines := each.strip().splitlines())), [])
     is_echo = len(lines) >= _FEWEST_LINES and all(_LINE.fullmatch(line) for line in lines)
-    return EchoedMessages() if is_echo else None
+    return Objects(cut_echo) if is_echo else None
 
 
 def _as_line(text: bytes) -> bytes:

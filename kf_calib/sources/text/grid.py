@@ -14,13 +14,12 @@ from kf_calib.sources.text.cells import DECIMAL_POINT, Numbers
 from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, encoding_of, unpacked
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.spreadsheet import sheets_of
-from kf_calib.support.text import cut
+from kf_calib.support.text import SHOWN, cut
 
 ZIP = b"PK\x03\x04"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
-_SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _FEWEST = 3  # columns
@@ -74,7 +73,7 @@ def _of_excel(path: Path) -> Grid:
     if hidden := ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden):
         remarks.append(f"{hidden} was not read, as it is hidden")
     if rows := read.left_out:
-        numbers = ", ".join(map(str, rows[:_SHOWN])) + " ..." * (len(rows) > _SHOWN)
+        numbers = ", ".join(map(str, rows[:SHOWN])) + " ..." * (len(rows) > SHOWN)
         were = f"row {numbers} was" if len(rows) == 1 else f"rows {numbers} were"
         remarks.append(f"{were} not read, as hidden rows are no data")
     texts, delimiter = _texts([row for _, row in read.lines])

@@ -6,13 +6,13 @@ In lines as on a serial port each value has its name before it: ``aX: -0.06, aY:
 from __future__ import annotations
 
 import csv
+import itertools
 import re
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from kf_calib.sources.text.cells import are_stamps
-from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
+from kf_calib.sources.text.names import READINGS, face_of, is_unit, meanings_of, nameless
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -61,19 +61,18 @@ class TextHeading(NamedTuple):
         is_whole: whether these are all; rows are then all as well, and a cell may go over several lines. Raises
         csv.Error for such a cell without an end.
         """
+        lines = lines if is_whole else lines[: 2 * _ROWS]
         if labelled := _first_labelled(lines[:_ROWS]):
-            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], *labelled, is_whole)
+            return cls._of_labelled(lines, *labelled, is_whole)
         delimiter, start = _delimiter_in(lines[:_ROWS])
         if is_whole:
             reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
             cells = [(start + reader.line_num - 1, [cell.strip() for cell in row]) for row in reader]
         else:
-            first = enumerate(lines[start : start + 2 * _ROWS], start)
-            cells = [(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first]
+            cells = [(k, cells_of(lines[k].lstrip("\ufeff"), delimiter)) for k in range(start, len(lines))]
         heading = cls.of_cells(cells, delimiter)
         if count := _numbers_amid(lines[:_ROWS], heading):
-            names = [NAMELESS.format(k + 1) for k in range(count)]
-            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], [""] * count, names, is_whole)
+            return cls._of_labelled(lines, [""] * count, nameless(count), is_whole)
         return heading if is_whole else heading._replace(rows=heading.rows[:_ROWS])
 
     @classmethod
@@ -174,9 +173,9 @@ def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
         if sum(map(bool, labels)) < _FEWEST_LABELS or labels in seen:
             continue
         seen.append(labels)
-        named = [label or NAMELESS.format(k + 1) for k, label in enumerate(labels)]
-        header = [f"{name} [{unit or units[-1]}]" if label and (unit or units[-1]) else name
-                  for name, label, unit in zip(named, labels, units, strict=True)]  # fmt: skip
+        named = [(label or name, unit or units[-1] if label else "")
+                 for label, name, unit in zip(labels, nameless(len(labels)), units, strict=True)]  # fmt: skip
+        header = [f"{name} [{unit}]" if unit else name for name, unit in named]
         if _tell_readings(header):
             return labels, header
     return None
@@ -193,7 +192,7 @@ def _labelled_in(line: str) -> tuple[list[str], list[str], list[tuple[int, int]]
     stand; a label before three numbers is that of a vector."""
     spans = [match.span() for match in _IN_TEXT.finditer(line)] if len(line) < _LONGEST_LABELLED else []
     labels, units, end = list[str](), list[str](), 0
-    for (start, behind), (after, _) in pairwise([*spans, (len(line), 0)]):
+    for (start, behind), (after, _) in itertools.pairwise([*spans, (len(line), 0)]):
         label = _LABEL.search(line[max(end, start - _LONGEST_LABEL) : start])
         unit = _UNIT_BEHIND.match(line, behind, after)
         labels.append(label[1] if label else "")
@@ -248,8 +247,8 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
     wide = [k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)]
     if not wide:  # whatever it is, it is told by its first line
         return _names(rows[0]), 1, (0,)
-    at = next((k for k in wide[:_TITLES] if _tell_readings(_names(rows[k]))), -1)
-    at = at if at >= 0 else _above_values(rows, wide)
+    named = (k for k in wide[:_TITLES] if _tell_readings(_names(rows[k])))
+    at = next(itertools.chain(named, _above_values(rows, wide), wide))
     first = _names(rows[at])
     if _are_values(first):
         above = _names(rows[at - 1]) if at and _is_comment(rows[at - 1]) else [""]
@@ -257,7 +256,7 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
         names = [name] * bool(name) + above[1:]  # the mark, or a word for the names, may stand in a cell of its own
         names = names[1:] if len(names) == len(first) + 1 else names
         if len(names) != len(first) or _are_values(names):
-            return [NAMELESS.format(k + 1) for k in range(len(first))], at, ()
+            return nameless(len(first)), at, ()
         return names, at, (at - 1,)
     units = _names(rows[at + 1]) if at + 1 < len(rows) else []
     if any(is_unit(text) and text.strip("-1") for text in units) and not any(map(_NUMBER.fullmatch, units)):
@@ -269,16 +268,15 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
 
 def _tell_readings(names: Sequence[str]) -> bool:
     """Return whether names are those of columns with three readings."""
-    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= {"ax", "ay", "az"}
+    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= set(READINGS)
 
 
-def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:
-    """Return which of the wide rows is the last before a long run of values; the first where there is none."""
+def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> Iterator[int]:
+    """Yield which of the wide rows are the last before a long run of values."""
     are_values = [_are_values(rows[k]) for k in wide]
     for k in range(1, len(wide) - _RUN):
         if not are_values[k - 1] and all(are_values[k : k + _RUN]):
-            return wide[k - 1]
-    return wide[0]
+            yield wide[k - 1]
 
 
 def _are_values(cells: Sequence[str]) -> bool:

@@ -24,21 +24,18 @@ from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.cells import LineError, QuantityColumns
-from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
+from kf_calib.sources.text.columns import HOW, NOTHING, SLOWEST_S, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import grid_of
-from kf_calib.sources.text.names import QUATERNION, face_of
+from kf_calib.sources.text.names import QUATERNION, READINGS, SPREADS, face_of
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, reading_units
-from kf_calib.support.text import counted, cut
+from kf_calib.support.text import SHOWN, counted, cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_SAMPLES, _FAST_S = 50, 1.0
 _USUAL_PAUSE_S = 60.0
-_SHOWN = 6  # rows in a message
 _UNKNOWN = (0.0, 0.0, 0.0, 1.0)
 """The attitude that stands for those that are not known."""
 _MOST_OWN = 6  # rows of a table of own axes
-_BLANK = {"", "-", "–", "—"}
 _UP_DOWN = re.compile(r"([+\-−])\s*1\s*g", re.IGNORECASE)
 
 
@@ -148,13 +145,13 @@ class TableOfMeans:
         values, example = self.columns.values(quantity.at), f"9{self.columns.numbers.decimal}80665"
         for row, k in np.argwhere(~np.isfinite(values)).tolist():
             cell = self.columns.rows[row][quantity.at[k]]
-            if quantity.absent and cell.lower() in ("", *quantity.absent):
+            if cell.lower() in quantity.absent:
                 values[row, k] = math.nan
                 continue
             or_else = ", or remove the row" * (not cell and not is_optional)
             wanted = f"write {wanted} such as {example}{or_else}"
             raise self._refusal(row, quantity.at[k], wanted, is_optional=is_optional)
-        return values * quantity.factors
+        return values * (quantity.factors or 1.0)
 
     @cached_property
     def times(self) -> tuple[Floats, int | None]:
@@ -177,10 +174,10 @@ class TableOfMeans:
 
     def refuse_samples(self) -> None:
         """Raise InputError for a time series."""
-        if self.columns.marks_of_a_table or len(self.rows) <= _SAMPLES:
+        if not self.columns.may_be_samples:
             return
         step_s = float(np.median(np.diff(self.times[0])))
-        if step_s < _FAST_S:
+        if step_s < SLOWEST_S:
             raise InputError(
                 f"its {len(self.rows)} rows are samples, {step_s:.3g} s apart, and no table with a row a dwell: "
                 "evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
@@ -216,7 +213,7 @@ class TableOfMeans:
             axis, sign = next((told for cell in cells if (told := face_of(cell))), (0, 0))
             if sign and len(up_down) == 2:
                 extremes[axis] = columns.values(up_down)[row]
-            elif sign and len(readings) == 3 and {cells[k] for k in readings if k != readings[axis]} <= _BLANK:
+            elif sign and len(readings) == 3 and {cells[k] for k in readings if k != readings[axis]} <= NOTHING:
                 extremes[axis, int(sign < 0)] = columns.values(readings)[row, axis]
         return extremes
 
@@ -284,14 +281,13 @@ class TableOfMeans:
             return None, np.ones(len(self.rows), np.int64)
         self.said.append(f"standard deviations from {columns.named(list(dict.fromkeys(places)))}, "
                          f"of as many readings as {columns.named([count])} says")  # fmt: skip
-        deviations, numbers = QuantityColumns(tuple(places), (1.0,) * 3), QuantityColumns((count,), (1.0,))
-        values = self._values(deviations, "a standard deviation", is_optional=True)
+        values = self._values(QuantityColumns(tuple(places)), "a standard deviation", is_optional=True)
         for row, k in np.argwhere(values < 0.0).tolist():
             raise self._refusal(row, places[k], "a standard deviation is not negative")
         units, factors = [columns.meanings[place].unit for place in places], columns.raw.factors
         if units[0] and units[0] != "count":
             factors = self.units.mps2_per([unit or units[0] for unit in units])
-        counts = self._values(numbers, "a number of readings", is_optional=True)[:, 0]
+        counts = self._values(QuantityColumns((count,)), "a number of readings", is_optional=True)[:, 0]
         for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)).tolist():
             wanted = "write how many readings were averaged, a whole number of at least 2"
             raise self._refusal(row, count, wanted)
@@ -307,8 +303,8 @@ class TableOfMeans:
         lacking = np.isnan(values)
         if lacking.all() or not lacking.any():
             return values
-        empty = ", ".join(str(self.rows[row]) for row in np.flatnonzero(lacking)[:_SHOWN])
-        more = " ..." * (int(lacking.sum()) > _SHOWN)
+        empty = ", ".join(str(self.rows[row]) for row in np.flatnonzero(lacking)[:SHOWN])
+        more = " ..." * (int(lacking.sum()) > SHOWN)
         self._warn(f"has no temperature in rows {empty}{more}: it is interpolated in time there.")
         elapsed_s, _ = self.times
         return np.interp(elapsed_s, elapsed_s[~lacking], values[~lacking])

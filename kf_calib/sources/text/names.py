@@ -7,44 +7,27 @@ two sets of readings one is of the accelerometer, and angles beside a gyroscope 
 from __future__ import annotations
 
 import re
+import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.raw_input import UNITS
 from kf_calib.support.units import WORDS
 
-ACCEL = {
-    "m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "cm/s2": 1e-2,
-    "ft/s2": 0.3048, "in/s2": 0.0254, "count": 1.0,
-}  # fmt: skip
+ACCEL = {**UNITS, "mm/s2": 1e-3, "cm/s2": 1e-2, "ft/s2": 0.3048, "in/s2": 0.0254, "count": 1.0}
 """Units of readings in m/s^2; counts as they are."""
 ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 TEMPERATURE = ("c", "k", "f")
-_UNITS = {
-    "m/s2": "m/s2 m/s/s mps2 ms-2 м/с2 ms2", "mm/s2": "mm/s2 mms-2", "cm/s2": "cm/s2 cms-2 gal",
-    "ft/s2": "ft/s2 fts-2", "in/s2": "in/s2", "g": "g gn g0", "mg": "mg мg", "ug": "ug μg мкg",
-    "count": "count counts lsb digit digits raw adc",
-    "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град ° º",
-    "s": "s sec secs second seconds sekunde sekunden с сек",
-    "ms": "ms msec millis millisecond milliseconds мс",
-    "us": "us μs usec micros microsecond microseconds мкс",
-    "ns": "ns nsec nsecs nanosec nanosecond nanoseconds", "min": "min minute мин", "h": "h hour hours ч",
-    "c": "°c c degc degreesc celsius °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
-}  # fmt: skip
-"""As they are written, but for signs of powers and products."""
-_OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
+QUATERNION = ("qx", "qy", "qz", "qw")
 _SHORTEST_TIME = 2
 """Letters of a unit that is the name of a time; a shorter one may be a letter for something else."""
-
-
-def _unit_named(text: str) -> str:
-    """Return the unit that a text is; empty where it is none."""
-    plain = unicodedata.normalize("NFKC", text.replace("º", "°")).lower().replace("\u2212", "-")
-    return _OF_WORD.get(re.sub(r"[\s^*·⋅._()\[\]]", "", plain), "")
 
 
 def _plain(text: str) -> str:
@@ -53,55 +36,18 @@ def _plain(text: str) -> str:
     return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
 
 
-def _words(text: str) -> frozenset[str]:
-    return frozenset(_plain(text).split())
-
-
-_SPREAD = _words(
-    "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen "
-    "ско отклонение сигма разброс шум"
-)
-_FORCE = _words(
-    "a ac acc acce accl accel acceleration accelerometer accelerometers alpha beschleunigung beschl f force specific "
-    "ускорение ускорения акселерометр"
-)
-_READING = _FORCE | _words(
-    "reading readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output "
-    "signal value wert raw среднее средние показание показания датчик канал значение сигнал"
-)
-_LESSER = _words("linear lin free user gravity schwerkraft raw")
-"""Of two accelerations, that which is not the accelerometer's own: without gravity, gravity alone, or in counts."""
-_GYROSCOPE = _words(
-    "gyro gyr gy gx gz gyroscope gyroscopes angular omega velocity rate rates kreisel drehrate гироскоп гироскопа"
-)
-_FIELD = _words("mag magn magnetometer magnetometers magnetic magneto magnetfeld compass магнитометр магнитометра")
-_APART = _words("cov covariance covariances variance variances kovarianz")
-_TRUTH = _words("true truth ref reference wahr soll expected истинное эталон")
-_QUATERNION = _words("q quat quaternion quaternions кватернион")
-_ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
-_TIME = _words(
-    "time times ts zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
-)
-_LENGTH = _words("dwell duration dauer length lange длительность")
-_AXIS = _words("achse axis ось")
-"""Of a gimbal only where no other word stands beside it."""
-_TEMPERATURE = _words("temp tmp temperature temperatur t температура темп")
-_COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte число количество")
-_FACE = _words("face side seite position pose orientation lage richtung direction flache положение грань")
-_ANGLE = _ESTIMATED - {"euler", "attitude"} | _words(
-    "angle angles winkel gimbal azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen угол рамка "
-    "рамки ось азимут outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer наружный "
-    "наружная внешний внешняя внутренний внутренняя"
-)
-_PREFIXES = _SPREAD | _READING | {"grav"}
-_RANKS = (
-    _words("outer aussen aeussere ausserer наружный наружная внешний внешняя"),
-    _words("middle mitte mittlerer средний средняя"),
-    _words("inner innen innere innerer внутренний внутренняя"),
-)
+VOCABULARY = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
+"""The words that tell what is in a text."""
+_UNIT_OF_WORD = {word: unit for unit, words in VOCABULARY["units"].items() for word in words.split()}
+_KINDS = {kind: frozenset(_plain(words).split()) for kind, words in VOCABULARY["kinds"].items()}
+_READING = _KINDS["reading"] | _KINDS["force"]
+_PREFIXES = _READING | _KINDS["spread"] | {"s", "grav"}
 _CHANNELS = frozenset("xyz123ху")
 _AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
 _RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)(?:\s*(?:/|p|per)\s*s|[\s·]*s\s*\^?-1)|dps")
+_EXACT = re.compile(
+    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
+)
 _OF_EPOCH = ((1e18, "ns"), (1e15, "us"), (1e12, "ms"))
 """From which size on, and up to five times it, a stamp without a unit is one since 1970 in this unit: 2001 to 2128."""
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
@@ -130,6 +76,11 @@ def is_unit(text: str) -> bool:
     return bool(_unit_named(text)) or text.strip() in ("-", "1")
 
 
+def is_exact(name: str) -> bool:
+    """Whether a name is one of docs/format.md, to the letter: it goes before all others."""
+    return _EXACT.fullmatch(name.strip()) is not None
+
+
 def meaning_of(name: str) -> Meaning:
     """What the name of a column says; nothing, where it is longer than any name."""
     name = name if len(name) <= _LONGEST else ""
@@ -148,45 +99,36 @@ def _meaning_of(name: str) -> Meaning:
     channels = sorted(filter(_CHANNELS.__contains__, tokens), key=str.isdigit)  # acc2_x is the x of a second one
     channel = "".join(channels[:1]).translate(_AXES)
     words = set(tokens) - _CHANNELS
+    kinds = {kind for kind, known in _KINDS.items() if words & known}
     of_accel = unit if unit in ACCEL else ""
-    if words & _APART:
+    if "covariance" in kinds:
         return Meaning(other="covariance")
-    is_rate = words & _GYROSCOPE or ("w" in words and channel and not words & (_FACE | _QUATERNION))
+    is_rate = "gyroscope" in kinds or ("w" in words and channel and not kinds & {"face", "quaternion"})
     if is_rate or _RATE.search(lowered):
         return Meaning(other="rate")
-    if words & _FIELD or ("mg" in words and not words & _FORCE):
+    if "magnetometer" in kinds or ("mg" in words and "force" not in kinds):
         return Meaning(other="field")
-    if words & _FACE and (channel or "w" in words):
+    if "face" in kinds and (channel or "w" in words):
         return Meaning(other="attitude")
-    if words & _LENGTH:
+    if "length" in kinds:
         return Meaning("", unit)
-    if (words & _TIME and (not unit or unit in TIME)) or (
+    if ("time" in kinds and (not unit or unit in TIME)) or (
         unit in TIME and not (channel and (words or lowered[-1].isalpha()))  # X [s] is the horizontal axis of a plot
     ):
         return Meaning("time", unit)
-    if words & (_TEMPERATURE - {"t"}) or ("t" in words and unit in (*TEMPERATURE, "deg")) or unit == "c":
+    if words & (_KINDS["temperature"] - {"t"}) or ("t" in words and unit in (*TEMPERATURE, "deg")) or unit == "c":
         return Meaning("temperature", unit if unit in TEMPERATURE else "")
-    if unit in ANGLE or (words & _ANGLE and unit not in ACCEL and (words - _AXIS & _ANGLE or words <= _ANGLE)):
-        rank = next((k + 1 for k, known in enumerate(_RANKS) if words & known), 0)
+    is_angle = words - _KINDS["axis"] & _KINDS["angle"] or words <= _KINDS["angle"]
+    if unit in ANGLE or ("angle" in kinds and unit not in ACCEL and is_angle):
+        rank = next((k for k, gimbal in enumerate(("outer", "middle", "inner"), 1) if gimbal in kinds), 0)
         return Meaning("angle", unit if unit in ANGLE else "", rank)
-    if words & (_SPREAD - {"s"}) or ("s" in words and words <= _READING | {"s"}):
+    if "spread" in kinds or ("s" in words and words <= _READING | {"s"}):
         return Meaning(f"s{channel}" if channel else "sd", of_accel)
     if channel and (words & _READING or not words or of_accel):
-        return Meaning("", unit, other="true") if words & _TRUTH else Meaning(f"a{channel}", of_accel)
-    if words & _FACE:
+        return Meaning("", unit, other="true") if "truth" in kinds else Meaning(f"a{channel}", of_accel)
+    if "face" in kinds:
         return Meaning("face")
-    return Meaning("count") if words & _COUNT or lowered in _COUNT else Meaning("", unit)
-
-
-QUATERNION = ("qx", "qy", "qz", "qw")
-_EXACT = re.compile(
-    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
-)
-
-
-def is_exact(name: str) -> bool:
-    """Whether a name is one of docs/format.md, to the letter: it goes before all others."""
-    return _EXACT.fullmatch(name.strip()) is not None
+    return Meaning("count") if "count" in kinds else Meaning("", unit)
 
 
 def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning]:
@@ -196,14 +138,17 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
     words = [{*_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower()), *_tokens(name[:_LONGEST].lower())} for name in names]
     if any(own.other in ("rate", "field") for own in meanings):
         for k, meaning in enumerate(meanings):  # the device has estimated them from these very readings
-            is_angle = meaning.ours == "angle" and not meaning.rank and bool(words[k] & (_ESTIMATED | set("xyz")))
+            is_angle = (
+                meaning.ours == "angle" and not meaning.rank and bool(words[k] & (_KINDS["estimated"] | set("xyz")))
+            )
             if is_angle or (meaning.ours in QUATERNION and not is_exact(names[k])):
                 meanings[k] = Meaning(other="attitude")
     # of several columns taken for a reading, those count whose names say most that they are the accelerometer's
     strengths = [
-        (is_exact(name), not own & _LESSER, bool(own & _FORCE)) for own, name in zip(words, names, strict=True)
+        (is_exact(name), not own & _KINDS["lesser"], bool(own & _KINDS["force"]))
+        for own, name in zip(words, names, strict=True)
     ]
-    for ours in ("ax", "ay", "az"):
+    for ours in READINGS:
         places = [k for k, own in enumerate(meanings) if own.ours == ours]
         best = max((strengths[k] for k in places), default=None)
         for k in places:
@@ -225,7 +170,7 @@ def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
         families.setdefault(tuple(stem), {}).setdefault(last, k)
     for stem, places in families.items():
         parts = next((each for each in ("xyzw", "1230") if set(places) >= set(each)), "")
-        if parts and set(stem) & _QUATERNION:
+        if parts and set(stem) & _KINDS["quaternion"]:
             for part, ours in zip(parts, QUATERNION, strict=True):
                 meanings[places[part]] = Meaning(ours)
         elif set(filter(str.isdigit, places)) == {"0", "1", "2"}:
@@ -253,6 +198,12 @@ def face_of(text: str) -> tuple[int, int] | None:
     return "xyz123".index(axis.lower()) % 3, (-1) ** sum(mark in ("-", "−", "–", "down", "unten") for mark in marks)
 
 
+def _unit_named(text: str) -> str:
+    """Return the unit that a text is; empty where it is none."""
+    plain = unicodedata.normalize("NFKC", text.replace("º", "°")).lower().replace("\u2212", "-")
+    return _UNIT_OF_WORD.get(re.sub(r"[\s^*·⋅._()\[\]]", "", plain), "")
+
+
 def _unit_of(name: str) -> tuple[str, str]:
     """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore.
 
@@ -268,7 +219,7 @@ def _unit_of(name: str) -> tuple[str, str]:
                     r"(.+?)\s*/\s*(\S+)"):  # fmt: skip
         match = re.fullmatch(pattern, name)
         unit = match and _unit_named(match[2])
-        if match and unit and (match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1]))):
+        if match and unit and (match[2] not in TEMPERATURE or _KINDS["temperature"] & set(_tokens(match[1]))):
             return match[1], unit
     unit = _unit_named(name) if len(name) >= _SHORTEST_TIME and name != "min" else ""
     return name, unit if unit in TIME else ""
@@ -279,7 +230,7 @@ def _tokens(text: str) -> list[str]:
     tokens = list[str]()
     for word in re.findall(r"[a-z]+|[а-я]+|\d+", _plain(text)):
         stem, last = word[:-1], word[-1]
-        known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _QUATERNION - {"q"})
+        known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _KINDS["quaternion"] - {"q"})
         tokens += [stem, last] if known else [word]
     return tokens
 
@@ -290,9 +241,14 @@ _MOSTLY = 0.9  # of the steps of a time go up, and of sizes are counted
 _LIKE, _CLOSE = 2.0, 0.01
 
 
+def nameless(count: int) -> list[str]:
+    """The names of so many columns that have none."""
+    return [NAMELESS.format(k + 1) for k in range(count)]
+
+
 def is_nameless(header: Sequence[str]) -> bool:
     """Whether columns have no names but their numbers."""
-    return bool(header) and all(name == NAMELESS.format(k + 1) for k, name in enumerate(header))
+    return bool(header) and list(header) == nameless(len(header))
 
 
 def meanings_by_numbers(values: Floats) -> list[Meaning]:

@@ -14,7 +14,9 @@ import io
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -138,16 +140,11 @@ def sheets_of(path: Path) -> list[Sheet]:
     need("openpyxl", "tables", f"reading {path}")
     import openpyxl
 
-    try:
+    with _read_by_openpyxl(path):
         with path.open("rb") as file:
             parts = _fit_parts(file)
-        with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
-            book: Any = openpyxl.load_workbook(_archive_without_cells(parts), read_only=True, data_only=True)
-            sheets = [Sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:
-        raise _unreadable(path, error) from None
+        book: Any = openpyxl.load_workbook(_archive_without_cells(parts), read_only=True, data_only=True)
+        sheets = [Sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
     return [sheet for sheet in sheets if sheet.lines]
 
 
@@ -156,18 +153,13 @@ def workbook_of(path: Path) -> Any:
     where it cannot be read as a whole."""
     import openpyxl
 
-    try:
+    with _read_by_openpyxl(path):
         with zipfile.ZipFile(path) as archive:
-            if sum(_merged(archive.read(part)) for part in archive.infolist() if part.filename.startswith(_SHEETS)) > (
-                _MOST_FILLED
-            ):
-                raise InputError("has more merged cells than any table of orientations: part them.")
-        with warnings.catch_warnings(action="ignore"):
-            return openpyxl.load_workbook(path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:
-        raise _unreadable(path, error) from None
+            sheets = [part for part in archive.infolist() if part.filename.startswith(_SHEETS)]
+            merged = sum(_merged(archive.read(sheet)) for sheet in sheets)
+        if merged > _MOST_FILLED:
+            raise InputError("has more merged cells than any table of orientations: part them.")
+        return openpyxl.load_workbook(path)
 
 
 def _merged(content: bytes) -> int:
@@ -178,19 +170,26 @@ def _merged(content: bytes) -> int:
     return sum(size["rows"] * size["columns"] for size in sizes)
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
-    """Return the error for what openpyxl raises for a damaged file, which depends on where the damage is."""
-    cause = error.__cause__ or error  # openpyxl says it again, with the name of the archive
-    if isinstance(error, KeyError):  # of a part that any spreadsheet has
-        return InputError(f"{path}: is an archive of files: unpack it, and give the one with the readings.")
-    said = cut(" ".join(str(cause).split()), 80) or type(cause).__name__
-    return InputError(f"{path}: is no Excel file that can be read ({said}): save it again.")
+@contextmanager
+def _read_by_openpyxl(path: Path) -> Iterator[None]:
+    """Raises InputError, with the path, for what is raised of a damaged file, which depends on where the damage is."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
+            yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except KeyError:  # of a part that any spreadsheet has
+        raise InputError(f"{path}: is an archive of files: unpack it, and give the one with the readings.") from None
+    except Exception as error:
+        cause = error.__cause__ or error  # openpyxl says it again, with the name of the archive
+        said = cut(" ".join(str(cause).split()), 80) or type(cause).__name__
+        raise InputError(f"{path}: is no Excel file that can be read ({said}): save it again.") from None
 
 
 def _fit_parts(file: Any) -> dict[str, bytes]:
     """Return the parts of an archive but its pictures; raises InputError where it unpacks to too much, or has XML that
     is none of a spreadsheet."""
-    size, tags, tags_of_sheets, parts = 0, 0, 0, dict[str, bytes]()
+    size, tags, parts = 0, Counter[bool](), dict[str, bytes]()
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
             if part.filename.startswith(_PICTURES):
@@ -199,11 +198,8 @@ def _fit_parts(file: Any) -> dict[str, bytes]:
             if size > _MOST_BYTES:
                 raise InputError("unpacks to more than any table of orientations: leave out what is not part of it.")
             parts[part.filename] = content = archive.read(part)
-            if part.filename.startswith(_SHEETS):
-                tags_of_sheets += content.count(b"<")
-            else:
-                tags += content.count(b"<")
-            if tags > _MOST_TAGS or tags_of_sheets > _MOST_TAGS_OF_SHEETS:
+            tags[part.filename.startswith(_SHEETS)] += content.count(b"<")
+            if tags[False] > _MOST_TAGS or tags[True] > _MOST_TAGS_OF_SHEETS:
                 raise InputError("has more cells than any table of orientations: leave out what is not part of it.")
             if any(word in content for word in _DECLARED):
                 raise InputError("has XML that declares entities, as no spreadsheet does: save it again.")

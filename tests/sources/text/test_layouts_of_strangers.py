@@ -13,7 +13,7 @@ import pytest
 from kf_calib.errors import InputError
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.opening import kind_of, opened
-from kf_calib.sources.text.documents import ArrayOfJson, EchoedMessages
+from kf_calib.sources.text.documents import Objects, cut_array, cut_echo
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.names import Meaning, meaning_of
 from kf_calib.sources.text.units import Units
@@ -162,7 +162,7 @@ def test_objects_of_many_lines_are_read(layout: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [1, 7, 100_000])
 def test_objects_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> None:
     array = json.dumps([{"t": k, "a": [1, {"b": 'x } \\" {'}]} for k in range(50)], indent=2).encode()
-    objects = ArrayOfJson()
+    objects = Objects(cut_array)
     lines = b"".join(objects.push(array[k : k + size]) for k in range(0, len(array), size)).splitlines()
     assert [json.loads(line)["t"] for line in lines] == [*range(50)]
 
@@ -171,7 +171,7 @@ def test_objects_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> Non
 def test_messages_do_not_depend_on_the_blocks_that_they_come_in(size: int) -> None:
     """A line that begins like a border is none."""
     text = "".join(f"header:\n  seq: {k}\nnote: 'a'\n---b: 1\nvalues:\n- {k}.5\n- µ\n---\n" for k in range(50)).encode()
-    objects = EchoedMessages()
+    objects = Objects(cut_echo)
     lines = b"".join(objects.push(text[k : k + size]) for k in range(0, len(text), size)).splitlines()
     assert [json.loads(line)["values.0"] for line in lines] == [k + 0.5 for k in range(50)]
     assert json.loads(lines[7]) == {"header.seq": 7, "note": "a", "---b": 1, "values.0": 7.5, "values.1": "µ"}
@@ -195,7 +195,7 @@ def test_of_a_log_that_was_cut_the_last_object_is_counted_and_not_read(layout: s
 
 
 def test_an_object_without_an_end_is_a_line_that_is_refused() -> None:
-    objects = ArrayOfJson()
+    objects = Objects(cut_array)
     assert objects.push(b'[{"t": 1}, {"x": "' + bytes(2_000_000)).splitlines()[0] == b'{"t": 1}'
     assert objects.push(b"") == b""  # it is not kept
 
