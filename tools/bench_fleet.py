@@ -25,6 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from kf_calib.cli.echo import json_value
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
@@ -54,7 +55,7 @@ def cost_of_a_row(runs: Sequence[ListedRun]) -> dict[str, float]:
 
     def alone(run: ListedRun) -> None:
         source, result = how.replay(Path(run.place))
-        json.dumps([replay_object(result), diagnosis_object(how.diagnose(source, result))])
+        json.dumps(json_value([replay_object(result), diagnosis_object(how.diagnose(source, result))]))
 
     alone(runs[0])
     how(runs[0])

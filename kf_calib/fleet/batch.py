@@ -37,6 +37,7 @@ from fsspec.implementations.local import LocalFileSystem
 from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.cli.command import values_of
+from kf_calib.cli.echo import json_value
 from kf_calib.cli.failures import sentence
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
 from kf_calib.diagnosis.missing_effect import diagnose
@@ -279,10 +280,10 @@ class RunEvaluation:
         row["unit"] = row["unit"] or notes.get("block_serial")
         row["bench"] = row["bench"] or notes.get("bench")
         row["date"] = row["date"] or run_date(source)
-        row |= run_list.of_replay(replay_object(result))
+        row |= run_list.of_replay(json_value(replay_object(result)))
         row |= run_list.of_factor(run_factor(result.fit))
         if result.bench.angles:  # without them there is no telling what depends on the attitude
-            row |= run_list.of_diagnosis(diagnosis_object(self.diagnose(source, result)))
+            row |= run_list.of_diagnosis(json_value(diagnosis_object(self.diagnose(source, result))))
 
 
 def _content(value: Any) -> Any:

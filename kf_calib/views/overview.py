@@ -16,7 +16,7 @@ from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.text.means import Survey
 from kf_calib.support.text import counted, cut
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.terminal import LINED, ConsoleTable, note, table
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
@@ -56,10 +56,10 @@ def overview_object(overview: Overview) -> dict[str, Any]:
     """One JSON object."""
     content = overview.content
     if isinstance(content, Inventory):
-        dwells = None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells]
+        dwells = overview.dwells
         keys = {
-            "recording": str(content.path), "format": content.format,
-            "files": [str(file) for file in content.files], "bytes": content.size,
+            "recording": content.path, "format": content.format,
+            "files": content.files, "bytes": content.size,
             "topics": [_topic_object(topic) for topic in content.topics],
         }  # fmt: skip
     else:
@@ -70,7 +70,7 @@ def overview_object(overview: Overview) -> dict[str, Any]:
             "columns": content.described_columns, "orientation": content.orientation or None,
         }  # fmt: skip
     keys |= {"bench": overview.bench, "dwells": dwells}
-    return clean(keys | members(overview, "missing", "command", "examples", "warnings"))
+    return keys | members(overview, "missing", "command", "examples", "warnings")
 
 
 def _topic_object(topic: Topic) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import pytest
 from helpers.synthetic import Run
 
 from kf_calib.bench.streams import Stream
+from kf_calib.cli.echo import json_value
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
@@ -45,7 +46,7 @@ def test_visits_are_numbered_from_one(result: Calibration) -> None:
 
 def test_findings_name_dwells_by_these_numbers(result: Calibration) -> None:
     assert result.readings.outliers.dwells == (8,)
-    assert replay_object(result)["readings"]["outliers"]["dwells"] == [8]
+    assert json_value(replay_object(result))["readings"]["outliers"]["dwells"] == [8]
     assert any("crowded in dwell 8 " in warning for warning in result.warnings)
 
 

@@ -18,6 +18,7 @@ from helpers.run_factors import campaign_of
 from helpers.synthetic import Run
 from kf_calib import calibrate
 from kf_calib.bench.streams import Batch
+from kf_calib.cli.echo import json_value
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.verification import verify
 from kf_calib.exports import TARGETS
@@ -86,7 +87,7 @@ def uses(folder: Path) -> Mapping[str, Any]:
     certified = ("certificate", paths[0], "--statement", lab, "--xml", folder / "c.xml", "-o", folder / "c.pdf")
     told = {
         "history": printed("history", *paths, "--tolerance", "K=20ppm", "--tolerance", "b=100ug"),
-        "verify": verification_object(verified), "certificate": printed(*certified),
+        "verify": json_value(verification_object(verified)), "certificate": printed(*certified),
         "saved": json.loads(paths[0].read_text()), "figures": ResultNumbers().add(verified, "verify").figures,
     }  # fmt: skip
     return told | {f"export {to}": exported(paths[0], to, folder / f"export-{to}") for to in TARGETS}
@@ -109,7 +110,7 @@ def readers(folder: Path) -> Mapping[str, Any]:
     told["bench_bag"] = streams(read(Recording(RECORDINGS / "bench_bag", BAG)))
     poses = calibrate(opened(RECORDINGS / "twelve_poses.csv", BAG))
     faces = calibrate(opened(RECORDINGS / "six_faces.xlsx", {"gravity_mps2": "9.81"}))
-    return told | {"poses": replay_object(poses), "faces": replay_object(faces)}
+    return told | json_value({"poses": replay_object(poses), "faces": replay_object(faces)})
 
 
 def streams(batch: Batch) -> Mapping[str, Any]:
@@ -132,7 +133,7 @@ def live(folder: Path) -> Mapping[str, Any]:
 
 def of_judgement(judged: Judgement, standing: Standing) -> Mapping[str, Any]:
     """What ``live`` says beside what ``replay`` and ``diagnose`` do, and the largest of what they say."""
-    told = live_object(judged, standing, None)
+    told = json_value(live_object(judged, standing, None))
     return {key: told[key] for key in ("p_value", "consistent", "looks", "time_left_s", "next_orientation", "model")}
 
 

@@ -8,6 +8,7 @@ from helpers.by_hand import by_hand
 from helpers.hidden_effects import noisy_run
 from helpers.result_numbers import ResultNumbers
 from kf_calib.bench.streams import Source
+from kf_calib.cli.echo import json_value
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
@@ -25,19 +26,19 @@ Numbers = Mapping[str, Any]
 
 def of_calibration(result: Calibration) -> Numbers:
     """Of ``replay``."""
-    return {"replay": replay_object(result), "figures": ResultNumbers().add(result, "replay").figures}
+    return {"replay": json_value(replay_object(result)), "figures": ResultNumbers().add(result, "replay").figures}
 
 
 def of_diagnosis(diagnosis: Diagnosis) -> Numbers:
     """Of ``replay`` and ``diagnose``."""
     told = {"replay": replay_object(diagnosis.before), "diagnose": diagnosis_object(diagnosis)}
-    return told | {"figures": ResultNumbers().add(diagnosis, "diagnose").figures}
+    return json_value(told) | {"figures": ResultNumbers().add(diagnosis, "diagnose").figures}
 
 
 def of_improvement(improvement: Improvement) -> Numbers:
     """Of ``improve``."""
     told = {"improve": improvement_object(improvement, None, {})}
-    return told | {"figures": ResultNumbers().add(improvement, "improve").figures}
+    return json_value(told) | {"figures": ResultNumbers().add(improvement, "improve").figures}
 
 
 def simulated(query: str, **keys: str) -> Source:
