@@ -1,8 +1,4 @@
-"""The runs of a fleet as a summary, and as a JSON object; how units and chances of a fleet are written in tables and
-figures.
-
-The diagnosis of many runs together, in words and tables.
-"""
+"""What many runs come to together as a report and as a JSON object, and how units and chances are written."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.coefficient_sizes import Detectable
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
-from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
@@ -30,6 +29,7 @@ from kf_calib.views.json import members, outlying_object, readings_object
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, TextPlot, note, table
 
+_OF_A_REPLICATION = "fall", "predicted", "p_value", "p_less", "halves"
 _ANY = 1e-6  # probability of rows that are in the JSON object
 _MOST = 5
 """Explanations in the table on one screen."""
@@ -74,7 +74,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
         "same_here": diagnosis.table.same if diagnosis.table and diagnosis.missing else [],
         "overlaps": diagnosis.overlaps,
         "replicates": diagnosis.replication.answer if diagnosis.replication else None,
-        "replication": _replication_object(diagnosis.replication),
+        "replication": diagnosis.replication and members(diagnosis.replication, *_OF_A_REPLICATION),
         "shapes": [shape_object(shape) for shape in shapes],
         "together": diagnosis.together,
         "may_be_scatter": diagnosis.as_scatter,
@@ -118,13 +118,6 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
         for row, odds in rows
         if row.probability > _ANY
     ]
-
-
-def _replication_object(tried: Replication | None) -> dict[str, Any] | None:
-    """Return how what is named predicts dwells that choosing it never saw, or None."""
-    if tried is None:
-        return None
-    return members(tried, "fall", "predicted", "p_value", "p_less", "halves")
 
 
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
