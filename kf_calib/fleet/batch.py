@@ -314,21 +314,15 @@ def local_copy(run: ListedRun) -> Iterator[Path]:
     cannot be fetched."""
     if run.refused:
         raise InputError(run.refused)
-    try:
+    with run_list.refused_by_store(run.place, "looked up", "what is installed"):
         files, path = url_to_fs(run.place)
-    except Exception as error:  # each store has errors of its own
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{run.place}: cannot be looked up ({said}): check the name and what is installed.") from None
     if isinstance(files, LocalFileSystem):
         yield _plain(Path(str(path)))
         return
     with TemporaryDirectory(prefix="kf-calib-") as folder:
         target = Path(folder, Path(str(path)).name)
-        try:
+        with run_list.refused_by_store(run.place, "fetched"):
             files.get(str(path), str(target), recursive=run.folder)
-        except Exception as error:  # each store has errors of its own
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{run.place}: cannot be fetched ({said}): check the name and the access.") from None
         yield target
 
 
