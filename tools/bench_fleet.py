@@ -25,13 +25,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from kf_calib.cli.echo import json_value
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 
 @dataclass(frozen=True)

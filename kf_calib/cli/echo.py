@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
 from typing import Any, TextIO
 
 import click
@@ -114,27 +112,10 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 def json_line(content: Mapping[str, Any]) -> str:
     """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
+    from kf_calib.views.json import json_value
+
     text = json.dumps(json_value(content), ensure_ascii=False, allow_nan=False)
     return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
-
-
-def json_value(value: Any, digits: int | None = None) -> Any:
-    """A value in types that JSON has: a dataclass as the mapping of its fields, arrays as lists, null for what is not
-    finite, and what is of no such type, as a path or an effect, as its text.
-
-    digits: significant ones of the numbers; None: all of them.
-    """
-    if hasattr(value, "tolist"):  # an array or a number of numpy
-        value = value.tolist()
-    if is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {key: json_value(item, digits) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_value(item, digits) for item in value]
-    if isinstance(value, float):
-        return float(value if digits is None else f"{value:.{digits}g}") if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
 def show(renderable: Any) -> None:

@@ -37,7 +37,6 @@ from fsspec.implementations.local import LocalFileSystem
 from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.cli.command import values_of
-from kf_calib.cli.echo import json_value
 from kf_calib.cli.failures import sentence
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
 from kf_calib.diagnosis.missing_effect import diagnose
@@ -53,7 +52,7 @@ from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import run_date
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -134,3 +136,22 @@ def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
 def members(of: object, *names: str) -> dict[str, Any]:
     """What an object has by these names, which are the keys of JSON."""
     return {name: getattr(of, name) for name in names}
+
+
+def json_value(value: Any, digits: int | None = None) -> Any:
+    """A value in types that JSON has: a dataclass as the mapping of its fields, arrays as lists, null for what is not
+    finite, and what is of no such type, as a path or an effect, as its text.
+
+    digits: significant ones of the numbers; None: all of them.
+    """
+    if hasattr(value, "tolist"):  # an array or a number of numpy
+        value = value.tolist()
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: json_value(item, digits) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(value if digits is None else f"{value:.{digits}g}") if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

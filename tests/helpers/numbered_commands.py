@@ -18,7 +18,6 @@ from helpers.run_factors import campaign_of
 from helpers.synthetic import Run
 from kf_calib import calibrate
 from kf_calib.bench.streams import Batch
-from kf_calib.cli.echo import json_value
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.verification import verify
 from kf_calib.exports import TARGETS
@@ -28,7 +27,7 @@ from kf_calib.online.status import Judgement, Standing
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import opened
 from kf_calib.views.exchange import verification_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live.objects import live_object
 
 printed = CommandLine().json

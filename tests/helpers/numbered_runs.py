@@ -8,7 +8,6 @@ from helpers.by_hand import by_hand
 from helpers.hidden_effects import noisy_run
 from helpers.result_numbers import ResultNumbers
 from kf_calib.bench.streams import Source
-from kf_calib.cli.echo import json_value
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
@@ -18,7 +17,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.views.diagnosis import diagnosis_object
 from kf_calib.views.improvement import improvement_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 Numbers = Mapping[str, Any]
 """What is stored of a case: a tree for each command, and the figures of all of the result."""

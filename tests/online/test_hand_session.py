@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, without_poses
-from kf_calib.cli.echo import json_value
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate
@@ -29,7 +28,7 @@ from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
 from kf_calib.sources.simulation.settings import SimulationOptions
 from kf_calib.views.console import plain
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live.content import content_of
 from kf_calib.views.live.objects import line, live_object
 from kf_calib.views.live.screen import screen

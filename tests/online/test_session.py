@@ -30,7 +30,7 @@ from helpers.synthetic import Run, plan_of
 from helpers.warm_command import warm
 
 from kf_calib.bench.streams import Batch
-from kf_calib.cli.echo import Printer, json_value
+from kf_calib.cli.echo import Printer
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
@@ -53,7 +53,7 @@ from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live import objects
 from kf_calib.views.live.content import Doing, content_of
 from kf_calib.views.live.screen import screen
