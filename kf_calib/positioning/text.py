@@ -14,7 +14,6 @@ from kf_calib.positioning.loop import Phase
 from kf_calib.positioning.positioner import HandPositioner
 from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
-from kf_calib.views.json import members
 from kf_calib.views.live.content import Doing
 from kf_calib.views.terminal import table
 
@@ -28,10 +27,7 @@ def run_object(drive: Drive) -> dict[str, Any]:
     return {
         "phase": drive.state.phase.value,
         "orientations": drive.state.number,
-        "decisions": [
-            members(decision, "number", "at_s", "purpose", "gimbal_deg", "stay_s", "why")
-            for decision in drive.decisions
-        ],
+        "decisions": drive.decisions,
         "ended": None if outcome is None else outcome.ended,
         "why": None if outcome is None else outcome.why,
         "stands_at_deg": None if outcome is None else outcome.stands_at,

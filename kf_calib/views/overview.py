@@ -118,7 +118,10 @@ def _recording_parts(inventory: Inventory) -> list[RenderableType]:
 def _table_parts(survey: Survey) -> list[RenderableType]:
     """Return how many rows there are, and the columns."""
     head = f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"
-    return [Text(head), _column_table(survey.described_columns)]
+    rows = [(cut(each["header"], 40), cut(each["first"], 24), _quantity(each["meaning"]),
+             _UNITS.get(each["unit"], each["unit"]), _TOLD[each["told_by"]])
+            for each in survey.described_columns]  # fmt: skip
+    return [Text(head), table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)]
 
 
 def _proposal(overview: Overview) -> str:
@@ -192,13 +195,6 @@ def pose_text(pose: Sequence[float]) -> str:
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
     return " ".join(f"{round(math.degrees(each), 2) + 0.0:.2f}°" for each in pose)
-
-
-def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
-    cells = ((each["header"], each["first"], each["meaning"], each["unit"], each["told_by"]) for each in columns)
-    rows = [(cut(header, 40), cut(first, 24), _quantity(meaning), _UNITS.get(unit, unit), _TOLD[told_by])
-            for header, first, meaning, unit, told_by in cells]  # fmt: skip
-    return table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)
 
 
 def _quantity(meaning: str) -> str:
