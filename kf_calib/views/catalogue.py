@@ -112,7 +112,7 @@ def sights_object(sights: Sequence[Visibility], model: Model, name: str) -> dict
     """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it; arguments
     as for ``sight_report``."""
     effects = [{**_object(each.effect), **_seen_object(each)} for each in sights]
-    return {"model": model.effects, "effects": effects}
+    return {"model": list(map(str, model.effects)), "effects": effects}
 
 
 def _seen_object(sight: Visibility) -> dict[str, Any]:

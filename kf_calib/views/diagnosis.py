@@ -62,7 +62,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
         "conditional_on": diagnosis.condition,
         "p_value": diagnosis.test.p_value,
         "verdict": verdict(diagnosis),
-        "model": diagnosis.before.model.effects,
+        "model": list(map(str, diagnosis.before.model.effects)),
         "missing": missing,
         "all_missing": diagnosis.missing,
         "hypotheses": _hypotheses_object(diagnosis.table),

@@ -37,7 +37,7 @@ def applied_object(
         "out": path,
         "topic": CALIBRATED_TOPIC if topic else None,
         **members(applied, "readings", "not_finite"),
-        "corrected": correction.effects,
+        "corrected": list(map(str, correction.effects)),
         "left_out": correction.left_out,
         "temperature_c": applied.temperature_c,
         "sigma_mps2": correction.worst_sigma_mps2,

@@ -47,7 +47,7 @@ def improvement_object(
             _step_object(step, before, state.floor_mps2)
             for step, before in zip(state.steps, [state.start, *(step.diagnosis for step in state.steps)], strict=False)
         ],
-        "model": state.result.model.effects,
+        "model": list(map(str, state.result.model.effects)),
         "stopped_because": state.because,
         "reason": state.reason,
         "verdict": state.diagnosis.verdict,
@@ -105,7 +105,7 @@ def _step_object(step: SelectionStep, before: Diagnosis, floor_mps2: float | Non
         "p_value": None if step.name is None else before.test.effects.p_values.get(step.name),
         "p_value_after": step.diagnosis.test.p_value,
         "dropped": [_removal_object(each) for each in step.dropped],
-        "model": step.result.model.effects,
+        "model": list(map(str, step.result.model.effects)),
         "coefficients": _parameters(step.result)[12:],
         "remarks": step.remarks,
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
         "dwells": len(dwells),
         "orientations": len(orientations(dwells)),
         "engine": result.settings.engine,
-        "model": result.model.effects,
+        "model": list(map(str, result.model.effects)),
         "parameters": parameters_object(result),
         "frame": frame_object(result),
         "biases_at_s": dwells[-1].end_s if noise.walk.steps else None,
@@ -139,8 +140,8 @@ def members(of: object, *names: str) -> dict[str, Any]:
 
 
 def json_value(value: Any, digits: int | None = None) -> Any:
-    """A value in types that JSON has: a dataclass as the mapping of its fields, arrays as lists, null for what is not
-    finite, and what is of no such type, as a path or an effect, as its text.
+    """A value in types that JSON has: a dataclass as the mapping of its fields, an array as a list, a path as its text,
+    and null for a number that is not finite.
 
     digits: significant ones of the numbers; None: all of them.
     """
@@ -154,4 +155,4 @@ def json_value(value: Any, digits: int | None = None) -> Any:
         return [json_value(item, digits) for item in value]
     if isinstance(value, float):
         return float(value if digits is None else f"{value:.{digits}g}") if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+    return str(value) if isinstance(value, PurePath) else value
