@@ -187,7 +187,7 @@ def test_nothing_lies_beside_the_packages() -> None:
 CEILINGS = {
     "kf_calib": 188,
     "support": 1071,
-    "bench": 1706,
+    "bench": 1708,
     "effects": 3129,
     "sources": 11873,
     "dwells": 3810,
@@ -196,17 +196,17 @@ CEILINGS = {
     "design": 1875,
     "diagnosis": 5814,
     "online": 1617,
-    "exchange": 1964,
-    "views": 6978,
-    "cli": 3533,
-    "report": 781,
+    "exchange": 1962,
+    "views": 6927,
+    "cli": 3528,
+    "report": 780,
     "bags": 403,
-    "certificate": 1504,
-    "exports": 1151,
-    "fleet": 4258,
+    "certificate": 1500,
+    "exports": 1146,
+    "fleet": 4245,
     "logs": 365,
-    "positioning": 1963,
-    "reproduction": 861,
+    "positioning": 1957,
+    "reproduction": 855,
 }
 """How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis and
 (by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
@@ -216,7 +216,8 @@ may err, for having no rows within dwells of what is not seen there, and for bia
 own size; and with effects for what lags behind anything and the way that gimbals turn. That of sources was raised for
 logs in layouts that their loggers chose, and for objects of many lines. Those of noise, estimation, exchange and views
 were raised for biases that walk by another amount each, and intervals that allow for it. Those of bench, support and
-dwells were raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels."""
+dwells were raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels, and for
+the names of the state."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 

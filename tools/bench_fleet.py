@@ -30,7 +30,7 @@ from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def cost_of_a_row(runs: Sequence[ListedRun]) -> dict[str, float]:
 
     def alone(run: ListedRun) -> None:
         source, result = how.replay(Path(run.place))
-        json.dumps([replay_object(result), diagnosis_object(how.diagnose(source, result))])
+        json.dumps(json_value([replay_object(result), diagnosis_object(how.diagnose(source, result))]))
 
     alone(runs[0])
     how(runs[0])

@@ -32,7 +32,7 @@ def driven() -> tuple[Drive, Floats, list[str]]:
     bench = DrivenBench(simulation(options_from_query(QUERY), {}), None, [0.0, 0.0, 0.0])
     session = Session.fed(bench.run.bench, wanted=targets_of(TARGETS), auto=True)
     itinerary = Itinerary(bench.run.bench, ends_when_named=False)
-    rules = Rules(itinerary.reach, itinerary.pace)
+    rules = Rules(itinerary.limits, itinerary.slew_times)
     drive = Drive(SimulatedPositioner(bench), session, itinerary, rules, SteppedTime(bench, session))
     drive.run()
     going = [decision for decision in drive.decisions if decision.gimbal_deg]

@@ -27,6 +27,8 @@ from kf_calib.support import units
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
 STATE_COUNT = len(SYMBOLS)
+STATES = tuple(f"{part}{i}" for i in (1, 2, 3) for part in ("sx", "sy", "sz", "b"))
+"""Names of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
 BIASES = [3, 7, 11]
 """Indices of the three biases in the affine state (s1, b1, s2, b2, s3, b3)."""
 UNITS = ("rad", "rad", "1", "m/s^2") * 3

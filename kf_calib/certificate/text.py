@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.support.units import shown
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import ConsoleTable, note, table
 
@@ -27,27 +27,23 @@ def certificate_object(
     certificate: Certificate, standing: str, check: MonteCarloCheck | None, path: Path, xml: Path | None
 ) -> dict[str, Any]:
     """The JSON object of ``certificate``."""
-    return clean(
-        {
-            "out": str(path),
-            "xml": None if xml is None else str(xml),
-            "xml_check": standing,
-            "number": certificate.statement.number,
-            "not_stated": list(certificate.missing),
-            "decision_rule": certificate.statement.decision_rule,
-            "parameters": [
-                members(each, *_OF_A_RESULT, "before", "limit", "conformity") for each in certificate.results
-            ],
-            "budget": [
-                {"symbol": line.name, **members(line, *_OF_A_LINE), "contribution": line.parts}
-                for line in certificate.budget.contributions
-            ],
-            "left_out": list(certificate.budget.left_out),
-            "covariance": None if certificate.twelve is None else certificate.twelve[1].tolist(),
-            "intrinsic": [members(each, *_OF_A_RESULT) for each in certificate.intrinsic],
-            "monte_carlo": None if check is None else members(check, "draws", "expanded", "agrees"),
-        }
-    )
+    return {
+        "out": path,
+        "xml": xml,
+        "xml_check": standing,
+        "number": certificate.statement.number,
+        "not_stated": certificate.missing,
+        "decision_rule": certificate.statement.decision_rule,
+        "parameters": [members(each, *_OF_A_RESULT, "before", "limit", "conformity") for each in certificate.results],
+        "budget": [
+            {"symbol": line.name, **members(line, *_OF_A_LINE), "contribution": line.parts}
+            for line in certificate.budget.contributions
+        ],
+        "left_out": certificate.budget.left_out,
+        "covariance": None if certificate.twelve is None else certificate.twelve[1],
+        "intrinsic": [members(each, *_OF_A_RESULT) for each in certificate.intrinsic],
+        "monte_carlo": check,
+    }
 
 
 def certificate_report(

@@ -184,7 +184,7 @@ def simulate(
         recorded = _record(source.by_hand() if no_angles else source, output, overwrite, tick)
     truth = write_truth(source, output, not no_angles)
     if as_json:
-        print_json({"recording": str(output), "truth": str(truth), **recorded.keys})
+        print_json({"recording": output, "truth": truth, **recorded.keys})
     else:
         echo(f"{output}: {recorded}; truth in {truth}")
 
@@ -228,7 +228,7 @@ def record(
         recorded = _record(source, output, overwrite, tick)
     warnings = [*source.warnings, *recorded.notes]
     if as_json:
-        print_json({"recording": str(output), **recorded.keys, "warnings": warnings})
+        print_json({"recording": output, **recorded.keys, "warnings": warnings})
         return
     echo(f"{output}: {recorded}")
     for warning in warnings:
@@ -339,8 +339,8 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
     say(Group("", comparison_table(compared)))
     say(f"\nTruth: {truth}.")
     if as_json:
-        files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
-        print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
+        print_json({"recording": recording, "truth": truth, "view": rrd, "replay": replay_object(result),
+                    "compare": compare_object(compared)})  # fmt: skip
     with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
         kept = deliver.keep(rrd, lambda path: write_view(result, path))
     if kept:

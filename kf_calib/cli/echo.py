@@ -112,7 +112,9 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 def json_line(content: Mapping[str, Any]) -> str:
     """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
-    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+    from kf_calib.views.json import json_value
+
+    text = json.dumps(json_value(content), ensure_ascii=False, allow_nan=False)
     return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 

@@ -1,12 +1,8 @@
-"""What a command that failed says: one sentence, whatever went wrong.
+"""What a command that failed says: one sentence, whatever went wrong; and the signals that end one before its time.
 
 What was not foreseen leaves a report for a maintainer, with nothing of the user's data: the kind of the error and of
 those behind it, the lines of program that were at work, versions, and the names of the options that were given. It has
 no message, no value and no name of a file: these may hold data.
-
-Signals that ask a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the terminal is closed.
-
-On Windows SIGBREAK stands for the last two: Ctrl-Break, and a console that is closed.
 """
 
 from __future__ import annotations
@@ -140,7 +136,8 @@ def _version(package: str) -> str:
 
 @contextmanager
 def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
-    """Have ``answer`` called for each of them; SIGHUP stays ignored where it was (nohup).
+    """Have ``answer`` called for each signal that asks a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the
+    terminal is closed and stays ignored where it was (nohup); on Windows SIGBREAK stands for the last two.
 
     After a SIGHUP further ones are ignored for good: terminal and shell both send one, and the second must not kill
     the process while it writes its results and ends.

@@ -1,6 +1,5 @@
-"""The files that commands write: which they are, and their turn, which comes when the result has been printed.
-
-Among them are pictures (the Rerun view, figures) and the page of a report.
+"""The files that commands write, pictures and pages among them: which they are, and their turn, which comes when the
+result has been printed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A live run in a thread of its own, beside the screen, the keys and the signals.
-
-Single keys pressed on the terminal of a live run.
-"""
+"""A live run in a thread of its own, beside the screen, the signals, and the keys pressed on its terminal."""
 
 from __future__ import annotations
 

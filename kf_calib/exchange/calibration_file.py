@@ -206,7 +206,7 @@ def _saved(result: Calibration, recording: str, sha256: str | None, began: datet
         parameters=[SavedParameter(symbol=p.symbol, value=p.value, sigma=p.sigma, unit=p.unit, nominal=p.nominal)
                     for p in result.parameters.values()],
         state=SavedState(
-            symbols=[*agreement.AFFINE, *(c.symbol for c in result.model.coefficients)],
+            symbols=[*paper_parameters.STATES, *(c.symbol for c in result.model.coefficients)],
             values=estimate.state.tolist(),
             covariance=estimate.covariance.tolist(),
             undetermined=list(result.undetermined),

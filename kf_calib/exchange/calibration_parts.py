@@ -2,7 +2,7 @@
 
 Most of what a file says follows from its state, the covariance of that, and the bench. It stands there in words of its
 own for people and other programs, who may read one place or the other: what is written twice must be the same, and
-where both differ, the file is refused. ``check_agreement`` raises ValueError, which says what contradicts what.
+where both differ, the file is refused: each ``refuse_...`` raises ValueError, which says what contradicts what.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.bench.paper_parameters import STATE_COUNT, STATES
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import CONTROLS, LONGEST, cut, parse_date
@@ -143,8 +143,6 @@ class SavedProvenance(FilePart):
     warnings: list[Text]
 
 
-AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b"))
-"""Symbols of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
 _LARGEST_VARIANCE = 1e60  # far beyond any, and products of a few are numbers still
 _NEGATIVE = 1e-6  # of correlations that are rounded
 _LEAST_VOLUME = 1e-6  # that unit vectors along the input axes span
@@ -157,7 +155,7 @@ _FRAME = {"theta1", "phi1", "nu2"}
 def refuse_state(state: SavedState, fixed: Collection[str]) -> None:
     """Refuse a state of other symbols, or a covariance that is none; fixed: parameters that were not estimated."""
     count = len(state.symbols)
-    if tuple(state.symbols[:STATE_COUNT]) != AFFINE or len(state.values) != count:
+    if tuple(state.symbols[:STATE_COUNT]) != STATES or len(state.values) != count:
         raise ValueError("state has other symbols than its values need")
     _refuse_repeated(state.symbols, "state.symbols")
     unknown = set(state.undetermined) - {*paper_parameters.SYMBOLS, *state.symbols[STATE_COUNT:]}

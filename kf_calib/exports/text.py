@@ -11,26 +11,23 @@ from rich.text import Text
 from kf_calib.exports.noise_keys import NoiseExport
 from kf_calib.exports.target import Target
 from kf_calib.support.units import shown
-from kf_calib.views.json import clean
 from kf_calib.views.terminal import note
 
 
 def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
     """The JSON object of ``export``."""
     left = target.error_left
-    return clean(
-        {
-            "out": str(path),
-            "format": to,
-            "lost": list(target.lost),
-            "left_out": target.correction.left_out,
-            "takes": str(target.input),
-            "to_be_done_before": target.to_be_done_before or None,
-            "error_left_rms_mps2": None if left is None else left.rms_mps2,
-            "error_left_worst_mps2": None if left is None else left.worst_mps2,
-            "warnings": [*target.remarks, *(target.noise.remarks if target.noise else ())],
-        }
-    )
+    return {
+        "out": path,
+        "format": to,
+        "lost": target.lost,
+        "left_out": target.correction.left_out,
+        "takes": str(target.input),
+        "to_be_done_before": target.to_be_done_before or None,
+        "error_left_rms_mps2": None if left is None else left.rms_mps2,
+        "error_left_worst_mps2": None if left is None else left.worst_mps2,
+        "warnings": [*target.remarks, *(target.noise.remarks if target.noise else ())],
+    }
 
 
 def exported_report(target: Target, to: str, path: Path) -> RenderableType:
@@ -52,15 +49,13 @@ def exported_report(target: Target, to: str, path: Path) -> RenderableType:
 
 def noise_export_object(export: NoiseExport, to: str, path: Path) -> dict[str, Any]:
     """The JSON object of ``export`` of noise alone."""
-    return clean(
-        {
-            "out": str(path),
-            "format": to,
-            "keys": {key.name: key.value for key in export.keys},
-            "limits": [key.name for key in export.keys if key.is_limit],
-            "warnings": list(export.remarks),
-        }
-    )
+    return {
+        "out": path,
+        "format": to,
+        "keys": {key.name: key.value for key in export.keys},
+        "limits": [key.name for key in export.keys if key.is_limit],
+        "warnings": export.remarks,
+    }
 
 
 def noise_export_report(export: NoiseExport, to: str, path: Path) -> RenderableType:

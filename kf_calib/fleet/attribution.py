@@ -1,18 +1,13 @@
 """Which effects many runs have, and of what each is: the likeliest terms one after another, each against all rivals.
 
-A term is taken in if no further term has a probability below 1 %. As all hypotheses compete in one table with
-probabilities, noise alone leads to a first term in at most 1 % of campaigns, however many effects are tried (Markov's
-inequality, for noise as it is stated). After each new term the others are decided anew beside it.
-
-The table of hypotheses that compete to be the next term: every effect with every attribution, and none of them.
+A term is taken in if no further term has a probability below 1 %. As all hypotheses (every effect with every
+attribution, and none of them) compete in one table with probabilities, noise alone leads to a first term in at most 1 %
+of campaigns, however many effects are tried (Markov's inequality, for noise as it is stated). After each new term the
+others are decided anew beside it.
 
 Before the runs, none has a probability of one half. The other half is shared equally by the effects that the runs can
 show, and the share of an effect by what can have it, as its physics says: an error of an encoder is never of sensors.
 A bench that was repaired, and what is each run's own, are a quarter as likely as the others.
-
-The evidence that coefficients are each unit's own, drawn about the mean of a population (random effects).
-
-It is exact for normal coefficients of a given spread, and averaged over the spread and the ratio of the mean to it.
 """
 
 from __future__ import annotations
@@ -208,7 +203,11 @@ def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
 
 
 class OwnCoefficients:
-    """Sums over units (or runs, by the attribution) for one effect, for each spread of a grid."""
+    """Sums over units (or runs, by the attribution) for one effect, for each spread of a grid: the evidence that its
+    coefficients are each one's own, drawn about the mean of a population (random effects).
+
+    It is exact for normal coefficients of a given spread, and averaged over the spread and the ratio of the mean to it.
+    """
 
     def __init__(self, group: Group, attribution: Attribution, terms: PooledTerms) -> None:
         self._terms, self._group, self._attribution = terms, group, attribution

@@ -52,7 +52,7 @@ from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import run_date
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""
@@ -279,10 +279,10 @@ class RunEvaluation:
         row["unit"] = row["unit"] or notes.get("block_serial")
         row["bench"] = row["bench"] or notes.get("bench")
         row["date"] = row["date"] or run_date(source)
-        row |= run_list.of_replay(replay_object(result))
+        row |= run_list.of_replay(json_value(replay_object(result)))
         row |= run_list.of_factor(run_factor(result.fit))
         if result.bench.angles:  # without them there is no telling what depends on the attitude
-            row |= run_list.of_diagnosis(diagnosis_object(self.diagnose(source, result)))
+            row |= run_list.of_diagnosis(json_value(diagnosis_object(self.diagnose(source, result))))
 
 
 def _content(value: Any) -> Any:
@@ -313,21 +313,15 @@ def local_copy(run: ListedRun) -> Iterator[Path]:
     cannot be fetched."""
     if run.refused:
         raise InputError(run.refused)
-    try:
+    with run_list.refused_by_store(run.place, "looked up", "what is installed"):
         files, path = url_to_fs(run.place)
-    except Exception as error:  # each store has errors of its own
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{run.place}: cannot be looked up ({said}): check the name and what is installed.") from None
     if isinstance(files, LocalFileSystem):
         yield _plain(Path(str(path)))
         return
     with TemporaryDirectory(prefix="kf-calib-") as folder:
         target = Path(folder, Path(str(path)).name)
-        try:
+        with run_list.refused_by_store(run.place, "fetched"):
             files.get(str(path), str(target), recursive=run.folder)
-        except Exception as error:  # each store has errors of its own
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{run.place}: cannot be fetched ({said}): check the name and the access.") from None
         yield target
 
 

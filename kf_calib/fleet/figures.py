@@ -184,7 +184,9 @@ def bench_terms(figure: Figure, overview: FleetOverview) -> None:
     """Each error of a bench that was found: its coefficients in parts of the campaign, and those of all of it."""
     terms = [each for each in (overview.pooled.findings if overview.pooled else ()) if each.over_time]
     if not terms:
-        return _say_alone(figure, _no_terms(overview))
+        if overview.pooled is None:
+            return _say_alone(figure, "The runs were not diagnosed together.")
+        return _say_alone(figure, "The runs show no error of a bench.")
     pairs = [(term, bench) for term in terms for bench in dict.fromkeys(each.bench for each in term.over_time)]
     wide = min(len(pairs), 2)
     high = -(-len(pairs) // wide)
@@ -194,12 +196,6 @@ def bench_terms(figure: Figure, overview: FleetOverview) -> None:
         _followed(axes, term, bench)
     for axes in [*panels.flat][len(pairs) :]:
         axes.set_axis_off()
-
-
-def _no_terms(overview: FleetOverview) -> str:
-    if overview.pooled is None:
-        return "The runs were not diagnosed together."
-    return "The runs show no error of a bench."
 
 
 def _followed(axes: Axes, term: Finding, bench: str) -> None:

@@ -1,6 +1,5 @@
-"""What the runs of a fleet come to together: parameters, verdicts by week, common effects, units to look at first.
-
-One parameter over all runs: population of the units with its outliers, and how runs of a unit scatter.
+"""What the runs of a fleet come to together: each parameter over the population of the units, verdicts by week, common
+effects, units to look at first.
 """
 
 from __future__ import annotations

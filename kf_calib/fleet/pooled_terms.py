@@ -1,10 +1,8 @@
-"""Terms of the pooled model of many runs, and what they leave of everything else.
+"""Terms of the pooled model of many runs, what they leave of everything else, and the evidence of those of a bench.
 
-A term is an effect with an attribution: coefficients that all runs of a bench have in common, or coefficients of each
-unit (or run) that are drawn about a common mean. The terms are eliminated from the inside out, each with its normal
-prior: first what is a unit's own, then what units have in common.
-
-Evidence of coefficients that all runs of a bench have in common, or that change once when the bench is repaired.
+A term is an effect with an attribution: coefficients that all runs of a bench have in common (or that change once, when
+it is repaired), or coefficients of each unit (or run) that are drawn about a common mean. The terms are eliminated from
+the inside out, each with its normal prior: first what is a unit's own, then what units have in common.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, one_blas_thread
+from kf_calib.bench.paper_parameters import STATES
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.errors import InputError, check_number
@@ -23,9 +24,6 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.score_test import whiten_model
 from kf_calib.noise.noise_model import Noise
-
-STATES = tuple(f"{part}{i}" for i in (1, 2, 3) for part in ("sx", "sy", "sz", "b"))
-"""Names of the twelve affine states: s_i = K_i E_i, the sensitivity of accelerometer i along x, y, z, and its bias."""
 
 
 def column_name(effect: Effect | str, symbol: str) -> str:

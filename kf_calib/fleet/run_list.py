@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
@@ -20,8 +21,9 @@ from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Mask
+from kf_calib.bench.paper_parameters import STATES
 from kf_calib.errors import InputError
-from kf_calib.fleet.run_factor import STATES, RunFactor
+from kf_calib.fleet.run_factor import RunFactor
 
 _LONGEST = 4096  # characters of a name
 _RECORDINGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -75,27 +77,35 @@ def runs_of(words: Iterable[str]) -> list[ListedRun]:
     return list(runs.values())
 
 
-def _named_by(word: str) -> Iterator[ListedRun]:
-    """Yield the recordings of one word."""
+@contextmanager
+def refused_by_store(name: str, what: str, advice: str = "the access") -> Iterator[None]:
+    """Raise InputError in place of the errors that each store has of its own."""
     try:
-        files, path = url_to_fs(word)
-        path = str(path)
-        if fsspec.core.has_magic(path) and not files.exists(path):
-            yield from _in_listing(files, files.glob(path, detail=True))
-        elif files.isdir(path):
-            listing = files.find(path, detail=True)
-            yield from _in_listing(files, listing, recordings_only=True)
-        elif (lines := _listed(files, path)) is not None:
-            yield from _of_list(word, files, path, lines)
-        else:
-            yield _run(files, path, files.info(path))
-    except FileNotFoundError:
-        raise InputError(f"{word} is not there: name recordings, folders, globs, or a list of these.") from None
+        yield
     except InputError:
         raise
-    except Exception as error:  # each store has errors of its own
+    except Exception as error:
         why = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{word}: cannot be looked up ({why}): check the name and the access.") from None
+        raise InputError(f"{name}: cannot be {what} ({why}): check the name and {advice}.") from None
+
+
+def _named_by(word: str) -> Iterator[ListedRun]:
+    """Yield the recordings of one word."""
+    with refused_by_store(word, "looked up"):
+        try:
+            files, path = url_to_fs(word)
+            path = str(path)
+            if fsspec.core.has_magic(path) and not files.exists(path):
+                yield from _in_listing(files, files.glob(path, detail=True))
+            elif files.isdir(path):
+                listing = files.find(path, detail=True)
+                yield from _in_listing(files, listing, recordings_only=True)
+            elif (lines := _listed(files, path)) is not None:
+                yield from _of_list(word, files, path, lines)
+            else:
+                yield _run(files, path, files.info(path))
+        except FileNotFoundError:
+            raise InputError(f"{word} is not there: name recordings, folders, globs, or a list of these.") from None
 
 
 def _in_listing(

@@ -1,8 +1,4 @@
-"""The runs of a fleet as a summary, and as a JSON object; how units and chances of a fleet are written in tables and
-figures.
-
-The diagnosis of many runs together, in words and tables.
-"""
+"""What many runs come to together as a report and as a JSON object, and how units and chances are written."""
 
 from __future__ import annotations
 
@@ -20,7 +16,7 @@ from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis,
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import Fleet
 from kf_calib.support.units import shown
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import ConsoleTable, note, table
 
@@ -60,15 +56,14 @@ def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
         "borne_by": _BORNE_BY[finding.attribution] if finding else None if row.no_one is None else "none",
         "probability": shares[finding.attribution] if finding else row.no_one,
         "probabilities": {each.value: share for each, share in shares.items()},
-        "rivals": dict(finding.rivals) if finding else {},
+        "rivals": finding.rivals if finding else {},
         "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*of_benches, *means]],
         "spread": people.spread if people else None,
         "spread_interval": people.spread_interval if people else None,
         "share": finding.share if finding else None,
         "share_interval": finding.share_interval if finding else None,
-        "units": [members(each, "unit", "probability") | {"coefficients": [vars(one) for one in each.coefficients]}
-                  for each in (finding.units if finding else ())],
-        "changed": [vars(each) for each in finding.repair.gaps] if finding and finding.repair else [],
+        "units": finding.units if finding else [],
+        "changed": finding.repair.gaps if finding and finding.repair else [],
     }  # fmt: skip
 
 
@@ -174,23 +169,21 @@ def fleet_object(
 ) -> dict[str, Any]:
     """The JSON object of ``fleet``."""
     failures = fleet.failures()
-    return clean(
-        {
-            "fleet": str(fleet.path),
-            "runs": len(fleet),
-            "failed": len(failures),
-            **members(done, "evaluated", "kept", "cpu_s"),
-            "units": fleet.distinct("unit"),
-            "benches": fleet.distinct("bench"),
-            "verdicts": fleet.verdicts(),
-            "parameters": [members(each, "symbol", "unit", "nominal") | each.of_runs for each in overview.tracks],
-            "failures": [{"run": run, "error": error} for run, error in failures.items()],
-            "pooled": pooled_objects(overview.pooled) if overview.pooled else None,
-            "bench_models": [str(path) for path in bench_models],
-            "another_look": [vars(each) for each in overview.looks],
-            "remarks": [*done.notes, *overview.remarks],
-        }
-    )
+    return {
+        "fleet": fleet.path,
+        "runs": len(fleet),
+        "failed": len(failures),
+        **members(done, "evaluated", "kept", "cpu_s"),
+        "units": fleet.distinct("unit"),
+        "benches": fleet.distinct("bench"),
+        "verdicts": fleet.verdicts(),
+        "parameters": [members(each, "symbol", "unit", "nominal") | each.of_runs for each in overview.tracks],
+        "failures": [{"run": run, "error": error} for run, error in failures.items()],
+        "pooled": pooled_objects(overview.pooled) if overview.pooled else None,
+        "bench_models": bench_models,
+        "another_look": overview.looks,
+        "remarks": [*done.notes, *overview.remarks],
+    }
 
 
 def fleet_report(fleet: Fleet, done: BatchProgress, overview: FleetOverview) -> RenderableType:

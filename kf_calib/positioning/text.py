@@ -14,7 +14,6 @@ from kf_calib.positioning.loop import Phase
 from kf_calib.positioning.positioner import HandPositioner
 from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
-from kf_calib.views.json import clean, members
 from kf_calib.views.live.content import Doing
 from kf_calib.views.terminal import table
 
@@ -25,21 +24,16 @@ if TYPE_CHECKING:
 def run_object(drive: Drive) -> dict[str, Any]:
     """The key ``run`` of the JSON objects: what the bench is doing, and all decisions so far."""
     outcome = drive.outcome
-    return clean(
-        {
-            "phase": drive.state.phase.value,
-            "orientations": drive.state.number,
-            "decisions": [
-                members(decision, "number", "at_s", "purpose", "gimbal_deg", "stay_s", "why")
-                for decision in drive.decisions
-            ],
-            "ended": None if outcome is None else outcome.ended,
-            "why": None if outcome is None else outcome.why,
-            "stands_at_deg": None if outcome is None else outcome.stands_at,
-            "stopped": None if outcome is None else outcome.stopped,
-            "lasted_s": None if outcome is None else outcome.lasted_s,
-        }
-    )
+    return {
+        "phase": drive.state.phase.value,
+        "orientations": drive.state.number,
+        "decisions": drive.decisions,
+        "ended": None if outcome is None else outcome.ended,
+        "why": None if outcome is None else outcome.why,
+        "stands_at_deg": None if outcome is None else outcome.stands_at,
+        "stopped": None if outcome is None else outcome.stopped,
+        "lasted_s": None if outcome is None else outcome.lasted_s,
+    }
 
 
 def doing_of(drive: Drive) -> Doing | None:
@@ -92,9 +86,9 @@ def dry_run_object(
 ) -> dict[str, Any]:
     """The same as JSON."""
     total_s = float(np.sum(slews_s)) + len(poses) * (stay_s + overhead_s)
-    stations = [[np.degrees(station).round(6).tolist() for station in way] for way in ways]
-    return clean({"gimbal_deg": np.degrees(poses).round(6).tolist(), "stations_deg": stations,
-                  "slew_s": list(slews_s), "stay_s": stay_s, "duration_s": total_s})  # fmt: skip
+    stations = [[np.degrees(station).round(6) for station in way] for way in ways]
+    return {"gimbal_deg": np.degrees(poses).round(6), "stations_deg": stations, "slew_s": slews_s, "stay_s": stay_s,
+            "duration_s": total_s}  # fmt: skip
 
 
 def _deg(pose: Floats) -> str:

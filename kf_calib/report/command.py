@@ -68,7 +68,7 @@ def report(
     from kf_calib.report.data_sheet import data_sheet_object, data_sheet_report
     from kf_calib.report.page import save
     from kf_calib.views import console, diagnosis
-    from kf_calib.views.json import clean, side_by_side_object
+    from kf_calib.views.json import side_by_side_object
 
     outputs, certificates = claimed(overwrite=overwrite), None
     if certificate is not None or statement is not None:
@@ -88,12 +88,12 @@ def report(
         pair, sources = SideBySide(other, diagnosed, has_other_model), [beside, measured]
     verdict = diagnosis.verdict(diagnosed) if pair is None else console.difference_in_words(pair)
     if as_json:
-        table: dict[str, Any] = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
+        table: dict[str, Any] = {"report": output, "recording": measured.name, "sha256": measured.sha256,
                  "consistent": diagnosed.consistent, "p_value": diagnosed.test.p_value,
                  "verdict": diagnosis.verdict(diagnosed)}  # fmt: skip
         table["data_sheet"] = None if sheet is None else data_sheet_object(sheet)
         beside_it = {"against": None, "differences": [], "differences_p_value": None}
-        print_json(clean(table | (beside_it if pair is None else side_by_side_object(pair))))
+        print_json(table | (beside_it if pair is None else side_by_side_object(pair)))
     else:
         show(verdict)
         if sheet is not None:

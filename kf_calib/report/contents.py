@@ -1,6 +1,5 @@
-"""What is on the page of a result: for each kind of result its verdict, and sections of figures, tables and words.
-
-What was measured: the recording, its fingerprint, bench, dwells and noise, as rows of words.
+"""What is on the page of a result: what was measured, and for each kind of result its verdict, and sections of figures,
+tables and words.
 """
 
 from __future__ import annotations

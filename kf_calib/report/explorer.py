@@ -15,7 +15,7 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
 from kf_calib.views.diagnosis import explains
-from kf_calib.views.json import clean
+from kf_calib.views.json import json_value
 from kf_calib.views.notation import unit_across
 
 _DIGITS = 5  # significant ones, which a page needs
@@ -38,7 +38,7 @@ def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[
     dwells = first.linearised.dwells
     models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
-        clean(
+        json_value(
             {
                 "dwells": [dwell.number for dwell in dwells],
                 "begin_s": [dwell.start_s for dwell in dwells],

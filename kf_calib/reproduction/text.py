@@ -13,7 +13,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
 from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionFit, ConditionSearch
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import ConsoleTable, table
 
@@ -29,40 +29,34 @@ _WORDS = {1: "one", 2: "two", 3: "three"}
 def paper_object(experiment: Experiment, searched: ConditionSearch) -> dict[str, Any]:
     """The JSON object of ``paper``; its table2 is in per cent, with ``optimal`` and ``nonoptimal`` by least squares."""
     sets = {"optimal": experiment.optimal, "nonoptimal": experiment.nonoptimal}
-    return clean(
-        {
-            "table2": [_row_object(experiment, symbol) for symbol in paper_parameters.SYMBOLS],
-            **members(experiment, "repetitions", "seed"),
-            "scatter": grebenkin2019.scatter(experiment.repetitions),
-            **{
-                name: {
-                    "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _paper_column(name))),
-                    "expected_log_ratio": float(
-                        grebenkin2019.log_ratio(column.orientations.expected, _paper_column(name))
-                    ),
-                    **members(column.orientations, "condition_numbers", "condition_numbers_in_g", "rank"),
-                    "kalman_difference_sigma": column.difference_sigma,
-                }
-                for name, column in sets.items()
-            },
-            "nonoptimal_gravity_fixed": {
-                **members(experiment.fixed, "rank", "condition_numbers", "same_vector"),
-                "why": rank_sentence(experiment),
-            },
-            "conditions": {**_conditions_object(experiment.conditions), "inferred": True},
-            "optimal_under_conditions": dict(
-                zip(("turned_after", "turned_at_first"), _turning(experiment), strict=True)
-            ),
-            "search": {
-                "tried": searched.tried,
-                "together": _found_object(searched.together),
-                "in_turn": _found_object(searched.in_turn),
-                "least_log_ratio_together": searched.floor,
-                "log_ratio_of_scatter_alone": searched.scatter,
-                "printed_bias_over_most_possible": searched.bias_excess,
-            },
-        }
-    )
+    return {
+        "table2": [_row_object(experiment, symbol) for symbol in paper_parameters.SYMBOLS],
+        **members(experiment, "repetitions", "seed"),
+        "scatter": grebenkin2019.scatter(experiment.repetitions),
+        **{
+            name: {
+                "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _paper_column(name))),
+                "expected_log_ratio": float(grebenkin2019.log_ratio(column.orientations.expected, _paper_column(name))),
+                **members(column.orientations, "condition_numbers", "condition_numbers_in_g", "rank"),
+                "kalman_difference_sigma": column.difference_sigma,
+            }
+            for name, column in sets.items()
+        },
+        "nonoptimal_gravity_fixed": {
+            **members(experiment.fixed, "rank", "condition_numbers", "same_vector"),
+            "why": rank_sentence(experiment),
+        },
+        "conditions": {**_conditions_object(experiment.conditions), "inferred": True},
+        "optimal_under_conditions": dict(zip(("turned_after", "turned_at_first"), _turning(experiment), strict=True)),
+        "search": {
+            "tried": searched.tried,
+            "together": _found_object(searched.together),
+            "in_turn": _found_object(searched.in_turn),
+            "least_log_ratio_together": searched.floor,
+            "log_ratio_of_scatter_alone": searched.scatter,
+            "printed_bias_over_most_possible": searched.bias_excess,
+        },
+    }
 
 
 def _paper_column(name: str) -> Floats:

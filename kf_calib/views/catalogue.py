@@ -14,7 +14,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, effect_rows, size_range
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import BARE, LINED, table
 
@@ -112,7 +112,7 @@ def sights_object(sights: Sequence[Visibility], model: Model, name: str) -> dict
     """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it; arguments
     as for ``sight_report``."""
     effects = [{**_object(each.effect), **_seen_object(each)} for each in sights]
-    return clean({"model": list(map(str, model.effects)), "effects": effects})
+    return {"model": list(map(str, model.effects)), "effects": effects}
 
 
 def _seen_object(sight: Visibility) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _seen_object(sight: Visibility) -> dict[str, Any]:
     return {
         "visible": sight.visible,
         "share_left": sight.share,
-        "not_determined": list(sight.unseen),
+        "not_determined": sight.unseen,
         "smallest": smallest,
         "overlaps": dict(sight.rivals),
         **members(sight, "degeneracy", "why"),
@@ -133,7 +133,7 @@ def _seen_object(sight: Visibility) -> dict[str, Any]:
 
 def effects_object(effects: Sequence[Effect]) -> dict[str, Any]:
     """The JSON object of ``effects``."""
-    return clean({"effects": [_object(effect) for effect in effects]})
+    return {"effects": [_object(effect) for effect in effects]}
 
 
 def _object(effect: Effect) -> dict[str, Any]:
@@ -147,8 +147,8 @@ def _object(effect: Effect) -> dict[str, Any]:
             members(each, "symbol", "unit", "scale", "shown_unit", "per_si") for each in effect.coefficients
         ],
         "unknown": None if unknown is None else members(unknown, "symbol", "unit", "low", "high"),
-        "typical": members(effect.typical, "navigation", "mems"),
+        "typical": effect.typical,
         "borne_by": effect.borne_by.value,
         **members(effect, "confused_with", "source"),
-        "remarks": list(remarks_of(effect)),
+        "remarks": remarks_of(effect),
     }

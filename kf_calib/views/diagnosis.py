@@ -16,7 +16,6 @@ from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.coefficient_sizes import Detectable
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
-from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
@@ -26,10 +25,11 @@ from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import clearest, p_cell, plain, with_sigma
-from kf_calib.views.json import clean, condition_object, members, outlying_object, readings_object
+from kf_calib.views.json import members, outlying_object, readings_object
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, TextPlot, note, table
 
+_OF_A_REPLICATION = "fall", "predicted", "p_value", "p_less", "halves"
 _ANY = 1e-6  # probability of rows that are in the JSON object
 _MOST = 5
 """Explanations in the table on one screen."""
@@ -57,45 +57,43 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     shapes = diagnosis.explanation.shapes if diagnosis.explanation else []
     trend = diagnosis.test.trend
-    return clean(
-        {
-            "consistent": diagnosis.consistent,
-            "conditional_on": condition_object(diagnosis.condition),
-            "p_value": diagnosis.test.p_value,
-            "verdict": verdict(diagnosis),
-            "model": [str(effect) for effect in diagnosis.before.model.effects],
-            "missing": missing,
-            "all_missing": list(diagnosis.missing),
-            "hypotheses": _hypotheses_object(diagnosis.table),
-            "families": [{"family": name, "probability": p} for name, p in diagnosis.table.families.items()]
-            if diagnosis.table
-            else [],
-            "suspects": [_suspect_object(each, diagnosis.floor_mps2) for each in diagnosis.suspects],
-            "ambiguity_set": list(diagnosis.ambiguity),
-            "same_here": list(diagnosis.table.same) if diagnosis.table and diagnosis.missing else [],
-            "overlaps": diagnosis.overlaps,
-            "replicates": diagnosis.replication.answer if diagnosis.replication else None,
-            "replication": _replication_object(diagnosis.replication),
-            "shapes": [shape_object(shape) for shape in shapes],
-            "together": [list(pair) for pair in diagnosis.together],
-            "may_be_scatter": diagnosis.as_scatter,
-            "invisible": diagnosis.test.invisible,
-            "vibration_hz": [line.frequency_hz for line in diagnosis.test.lines.vibration],
-            "trend": None
-            if trend is None
-            else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
-            "disturbed_dwells": disturbed_dwells(diagnosis),
-            "detectable": [
-                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
-            ],
-            "unknown": description_object(diagnosis.description),
-            "held_out_rms_mps2": diagnosis.before.held_out_rms_mps2,
-            "held_out_floor_mps2": diagnosis.floor_mps2,
-            "readings": readings_object(diagnosis.before.readings),
-            "outlying_dwells": [outlying_object(each) for each in diagnosis.before.outlying],
-            "warnings": list(diagnosis.before.warnings),
-        }
-    )
+    return {
+        "consistent": diagnosis.consistent,
+        "conditional_on": diagnosis.condition,
+        "p_value": diagnosis.test.p_value,
+        "verdict": verdict(diagnosis),
+        "model": list(map(str, diagnosis.before.model.effects)),
+        "missing": missing,
+        "all_missing": diagnosis.missing,
+        "hypotheses": _hypotheses_object(diagnosis.table),
+        "families": [{"family": name, "probability": p} for name, p in diagnosis.table.families.items()]
+        if diagnosis.table
+        else [],
+        "suspects": [_suspect_object(each, diagnosis.floor_mps2) for each in diagnosis.suspects],
+        "ambiguity_set": diagnosis.ambiguity,
+        "same_here": diagnosis.table.same if diagnosis.table and diagnosis.missing else [],
+        "overlaps": diagnosis.overlaps,
+        "replicates": diagnosis.replication.answer if diagnosis.replication else None,
+        "replication": diagnosis.replication and members(diagnosis.replication, *_OF_A_REPLICATION),
+        "shapes": [shape_object(shape) for shape in shapes],
+        "together": diagnosis.together,
+        "may_be_scatter": diagnosis.as_scatter,
+        "invisible": diagnosis.test.invisible,
+        "vibration_hz": [line.frequency_hz for line in diagnosis.test.lines.vibration],
+        "trend": None
+        if trend is None
+        else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
+        "disturbed_dwells": disturbed_dwells(diagnosis),
+        "detectable": [
+            {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
+        ],
+        "unknown": description_object(diagnosis.description),
+        "held_out_rms_mps2": diagnosis.before.held_out_rms_mps2,
+        "held_out_floor_mps2": diagnosis.floor_mps2,
+        "readings": readings_object(diagnosis.before.readings),
+        "outlying_dwells": [outlying_object(each) for each in diagnosis.before.outlying],
+        "warnings": diagnosis.before.warnings,
+    }
 
 
 def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
@@ -109,9 +107,9 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
     rows = () if table is None else zip(table.rows, table.log10_odds, strict=True)
     return [
         {
-            "effects": list(row.effects),
+            "effects": row.effects,
             "formula": row.formulas[0] if row.formulas else None,
-            "formulas": list(row.formulas),
+            "formulas": row.formulas,
             "driver": row.driver or None,
             **members(row, "families", "probability"),
             "log10_odds_to_next": odds,
@@ -122,21 +120,13 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
     ]
 
 
-def _replication_object(tried: Replication | None) -> dict[str, Any] | None:
-    """Return how what is named predicts dwells that choosing it never saw, or None."""
-    if tried is None:
-        return None
-    figures = members(tried, "fall", "predicted", "p_value", "p_less")
-    return {**figures, "halves": [vars(half) | {"dwells": list(half.dwells)} for half in tried.halves]}
-
-
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
     """The advice where to go next as a JSON object.
 
     advice: the orientation. why: the reason in words. The key stay_s is the time to stay there where it should be
     longer than the dwells so far, in s.
     """
-    return clean({"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why})
+    return members(advice, "gimbal_deg", "stay_s") | {"why": why}
 
 
 def advice_sentence(advice: Advice, why: str) -> str:

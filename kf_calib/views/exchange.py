@@ -21,7 +21,7 @@ from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.text import counted
 from kf_calib.support.units import field_unit, shown
 from kf_calib.views.console import p_cell, table_of_parameters
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import signed, symbol
 from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, note, table
 
@@ -33,18 +33,16 @@ def applied_object(
     correction: Correction, applied: Applied, path: Path, warnings: Sequence[str], topic: bool = True
 ) -> dict[str, Any]:
     """The JSON object of ``apply``."""
-    return clean(
-        {
-            "out": str(path),
-            "topic": CALIBRATED_TOPIC if topic else None,
-            **members(applied, "readings", "not_finite"),
-            "corrected": [str(effect) for effect in correction.effects],
-            "left_out": correction.left_out,
-            "temperature_c": applied.temperature_c,
-            "sigma_mps2": correction.worst_sigma_mps2,
-            "warnings": list(warnings),
-        }
-    )
+    return {
+        "out": path,
+        "topic": CALIBRATED_TOPIC if topic else None,
+        **members(applied, "readings", "not_finite"),
+        "corrected": list(map(str, correction.effects)),
+        "left_out": correction.left_out,
+        "temperature_c": applied.temperature_c,
+        "sigma_mps2": correction.worst_sigma_mps2,
+        "warnings": warnings,
+    }
 
 
 def applied_report(
@@ -68,19 +66,17 @@ def applied_report(
 
 def verification_object(verification: Verification) -> dict[str, Any]:
     """The JSON object of ``verify``."""
-    return clean(
-        {
-            **members(verification, "holds", "p_value", "statistic", "dof", "dwells"),
-            "moved": [members(move, *_OF_A_MOVE) for move in verification.moved],
-            "compared": [members(move, *_OF_A_MOVE) for move in verification.moves],
-            "residual_rms_mps2": verification.residual_rms_mps2,
-            "worst_error_mps2": verification.worst_mps2,
-            "worst_error_sigma_mps2": verification.worst_sigma_mps2,
-            "not_compared": list(verification.free),
-            "new_consistent": None if verification.new is None else verification.new.consistency.consistent,
-            "warnings": list(verification.warnings),
-        }
-    )
+    return {
+        **members(verification, "holds", "p_value", "statistic", "dof", "dwells"),
+        "moved": [members(move, *_OF_A_MOVE) for move in verification.moved],
+        "compared": [members(move, *_OF_A_MOVE) for move in verification.moves],
+        "residual_rms_mps2": verification.residual_rms_mps2,
+        "worst_error_mps2": verification.worst_mps2,
+        "worst_error_sigma_mps2": verification.worst_sigma_mps2,
+        "not_compared": verification.free,
+        "new_consistent": None if verification.new is None else verification.new.consistency.consistent,
+        "warnings": verification.warnings,
+    }
 
 
 def verification_report(verification: Verification) -> RenderableType:
@@ -120,22 +116,20 @@ def _moves_table(verification: Verification) -> ConsoleTable:
 
 def history_object(history: History) -> dict[str, Any]:
     """The JSON object of ``history``; drift in SI per day."""
-    return clean(
-        {
-            "serial": history.serial or None,
-            "dates": [date.isoformat() for date in history.dates],
-            "parameters": [
-                members(track, "symbol", "unit", "values", "sigmas", "predicted")
-                | {"predicted_sigmas": track.predicted_sigma}
-                | members(track, "level", "level_sigma", "drift", "drift_sigma", "repeatability", "walk", "constant_p")
-                for track in history.tracks
-            ],
-            "tolerances": dict(history.tolerances),
-            "due": None if history.due is None else history.due.isoformat(),
-            "due_by": history.due_by or None,
-            "warnings": list(history.warnings),
-        }
-    )
+    return {
+        "serial": history.serial or None,
+        "dates": [date.isoformat() for date in history.dates],
+        "parameters": [
+            members(track, "symbol", "unit", "values", "sigmas", "predicted")
+            | {"predicted_sigmas": track.predicted_sigma}
+            | members(track, "level", "level_sigma", "drift", "drift_sigma", "repeatability", "walk", "constant_p")
+            for track in history.tracks
+        ],
+        "tolerances": history.tolerances,
+        "due": None if history.due is None else history.due.isoformat(),
+        "due_by": history.due_by or None,
+        "warnings": history.warnings,
+    }
 
 
 def history_report(history: History) -> RenderableType:
@@ -176,7 +170,7 @@ def _track_row(track: ParameterTrack) -> list[str]:
 
 def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:
     """The JSON object of ``info`` of a calibration: what the file holds, and what it takes."""
-    return clean({"file": str(path), "kind": "calibration", "input": str(saved.bench.input), **saved.model_dump()})
+    return {"file": path, "kind": "calibration", "input": str(saved.bench.input), **saved.model_dump()}
 
 
 def calibration_report(saved: SavedCalibration, path: Path) -> RenderableType:

@@ -23,7 +23,7 @@ from kf_calib.views.diagnosis import (
     held_out_ratio,
     orientation_object,
 )
-from kf_calib.views.json import clean, condition_object, members, parameters_object
+from kf_calib.views.json import members, parameters_object
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import BARE, FOURS, VERDICT_STYLES, Bar, ConsoleTable, note, table
 
@@ -41,48 +41,44 @@ def improvement_object(
     state: the improvement. honest: its nested cross-validation (None: not made). files: paths written, by their keys.
     """
     unknown, going = state.diagnosis.description, state.diagnosis.next_orientation
-    return clean(
-        {
-            "start": _figures(state.start, state.floor_mps2),
-            "steps": [
-                _step_object(step, before, state.floor_mps2)
-                for step, before in zip(
-                    state.steps, [state.start, *(step.diagnosis for step in state.steps)], strict=False
-                )
-            ],
-            "model": [str(effect) for effect in state.result.model.effects],
-            "stopped_because": state.because,
-            "reason": state.reason,
-            "verdict": state.diagnosis.verdict,
-            **_figures(state.diagnosis, state.floor_mps2),
-            "parameters": _parameters(state.result),
-            "tests": [_removal_object(each) for each in state.removals],
-            "ambiguity_set": [each.name for each in state.alternatives],
-            "alternatives": [
-                {
-                    "effect": alternative.name,
-                    **members(alternative.result, "residual_rms_mps2", "held_out_rms_mps2"),
-                    "held_out_floor_mps2": state.floor_mps2,
-                    "parameters": _parameters(alternative.result),
-                }
-                for alternative in state.alternatives
-            ],
-            "spread": [
-                {
-                    "symbol": spread.parameter.symbol,
-                    **members(spread, "lowest", "highest"),
-                    **members(spread.parameter, "sigma", "unit"),
-                    "sigmas": spread.sigmas,
-                }
-                for spread in state.spreads
-            ],
-            "unknown": description_object(unknown),
-            "next_orientation": None if going is None else orientation_object(*going),
-            "honest": None if honest is None else vars(honest),
-            **{key: None if path is None else str(path) for key, path in files.items()},
-            "warnings": state.warnings,
-        }
-    )
+    return {
+        "start": _figures(state.start, state.floor_mps2),
+        "steps": [
+            _step_object(step, before, state.floor_mps2)
+            for step, before in zip(state.steps, [state.start, *(step.diagnosis for step in state.steps)], strict=False)
+        ],
+        "model": list(map(str, state.result.model.effects)),
+        "stopped_because": state.because,
+        "reason": state.reason,
+        "verdict": state.diagnosis.verdict,
+        **_figures(state.diagnosis, state.floor_mps2),
+        "parameters": _parameters(state.result),
+        "tests": [_removal_object(each) for each in state.removals],
+        "ambiguity_set": [each.name for each in state.alternatives],
+        "alternatives": [
+            {
+                "effect": alternative.name,
+                **members(alternative.result, "residual_rms_mps2", "held_out_rms_mps2"),
+                "held_out_floor_mps2": state.floor_mps2,
+                "parameters": _parameters(alternative.result),
+            }
+            for alternative in state.alternatives
+        ],
+        "spread": [
+            {
+                "symbol": spread.parameter.symbol,
+                **members(spread, "lowest", "highest"),
+                **members(spread.parameter, "sigma", "unit"),
+                "sigmas": spread.sigmas,
+            }
+            for spread in state.spreads
+        ],
+        "unknown": description_object(unknown),
+        "next_orientation": None if going is None else orientation_object(*going),
+        "honest": honest,
+        **files,
+        "warnings": state.warnings,
+    }
 
 
 def _figures(diagnosis: Diagnosis, floor_mps2: float | None) -> dict[str, Any]:
@@ -91,7 +87,7 @@ def _figures(diagnosis: Diagnosis, floor_mps2: float | None) -> dict[str, Any]:
     return {
         "p_value": diagnosis.test.p_value,
         "consistent": diagnosis.consistent,
-        "conditional_on": condition_object(diagnosis.condition),
+        "conditional_on": diagnosis.condition,
         **members(result, "residual_rms_mps2", "held_out_rms_mps2"),
         "held_out_floor_mps2": floor_mps2,
     }
@@ -109,9 +105,9 @@ def _step_object(step: SelectionStep, before: Diagnosis, floor_mps2: float | Non
         "p_value": None if step.name is None else before.test.effects.p_values.get(step.name),
         "p_value_after": step.diagnosis.test.p_value,
         "dropped": [_removal_object(each) for each in step.dropped],
-        "model": [str(effect) for effect in step.result.model.effects],
+        "model": list(map(str, step.result.model.effects)),
         "coefficients": _parameters(step.result)[12:],
-        "remarks": list(step.remarks),
+        "remarks": step.remarks,
     }
 
 

@@ -1,14 +1,17 @@
-"""Results as JSON objects with the keys on which other programs rely; NaN and infinity become null."""
+"""Results as JSON objects with the keys on which other programs rely; their values are those of the results."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kf_calib.estimation.cross_validation import orientations
-from kf_calib.estimation.results import Calibration, Condition, OutlyingDwell
+from kf_calib.estimation.results import Calibration, OutlyingDwell
 from kf_calib.estimation.signal_quality import Readings
 
 if TYPE_CHECKING:
@@ -19,42 +22,35 @@ if TYPE_CHECKING:
 def replay_object(result: Calibration) -> dict[str, Any]:
     """The JSON object of ``replay``."""
     judged, noise, dwells = result.consistency, result.noise, result.fit.dwells
-    return clean(
-        {
-            "samples": result.counts.read,
-            "dwells": len(dwells),
-            "orientations": len(orientations(dwells)),
-            "engine": result.settings.engine,
-            "model": [str(effect) for effect in result.model.effects],
-            "parameters": parameters_object(result),
-            "frame": frame_object(result),
-            "biases_at_s": dwells[-1].end_s if noise.walk.steps else None,
-            "noise": {
-                "sigma_mps2": noise.sigma_mps2,
-                "inflation": noise.inflation,
-                "dwell_sigma_mps2": noise.scatter_mps2,
-                "dwell_sigma_stated": noise.scatter.stated,
-                "angle_sigma_deg": None if noise.attitude_unknown else math.degrees(noise.setting_rad),
-                "angle_sigma_stated": noise.setting.stated and not noise.attitude_unknown,
-                "walk_mps2_per_sqrt_s": noise.walk_mps2_per_sqrt_s,
-            },
-            "consistency": {
-                "consistent": judged.unconditional,
-                "conditional_on": condition_object(judged.condition),
-                **members(judged, "p_value", "nis_per_dof", "dof"),
-            },
-            **members(result, "residual_rms_mps2", "held_out_rms_mps2", "held_out_floor_mps2"),
-            "counts": {key: value for key, value in vars(result.counts).items() if isinstance(value, int)},
-            "readings": readings_object(result.readings),
-            "outlying_dwells": [outlying_object(each) for each in result.outlying],
-            "warnings": list(result.warnings),
-        }
-    )
-
-
-def condition_object(condition: Condition | None) -> dict[str, Any] | None:
-    """What was not stated and an agreement rests on, as a JSON object, or None."""
-    return None if condition is None else vars(condition)
+    return {
+        "samples": result.counts.read,
+        "dwells": len(dwells),
+        "orientations": len(orientations(dwells)),
+        "engine": result.settings.engine,
+        "model": list(map(str, result.model.effects)),
+        "parameters": parameters_object(result),
+        "frame": frame_object(result),
+        "biases_at_s": dwells[-1].end_s if noise.walk.steps else None,
+        "noise": {
+            "sigma_mps2": noise.sigma_mps2,
+            "inflation": noise.inflation,
+            "dwell_sigma_mps2": noise.scatter_mps2,
+            "dwell_sigma_stated": noise.scatter.stated,
+            "angle_sigma_deg": None if noise.attitude_unknown else math.degrees(noise.setting_rad),
+            "angle_sigma_stated": noise.setting.stated and not noise.attitude_unknown,
+            "walk_mps2_per_sqrt_s": noise.walk_mps2_per_sqrt_s,
+        },
+        "consistency": {
+            "consistent": judged.unconditional,
+            "conditional_on": judged.condition,
+            **members(judged, "p_value", "nis_per_dof", "dof"),
+        },
+        **members(result, "residual_rms_mps2", "held_out_rms_mps2", "held_out_floor_mps2"),
+        "counts": {key: value for key, value in vars(result.counts).items() if isinstance(value, int)},
+        "readings": readings_object(result.readings),
+        "outlying_dwells": [outlying_object(each) for each in result.outlying],
+        "warnings": result.warnings,
+    }
 
 
 def parameters_object(result: Calibration) -> list[dict[str, Any]]:
@@ -94,53 +90,48 @@ def readings_object(readings: Readings) -> dict[str, Any]:
     """Quantisation, saturation and outliers of the readings."""
     return {
         "quantisation": [{**vars(each), "rms_mps2": each.rms_mps2} for each in readings.quantisation],
-        "saturation": [vars(each) for each in readings.saturation],
-        "outliers": vars(readings.outliers),
+        **members(readings, "saturation", "outliers"),
     }
 
 
 def compare_object(compared: Comparison) -> dict[str, Any]:
     """The JSON object of ``compare``: parameters, time, memory and differences of each way of computing."""
-    return clean(
-        {
-            "max_difference_sigma": compared.max_difference_sigma,
-            "engines": {
-                name: {
-                    **members(way, "wall_s", "peak_mb", "max_difference_sigma", "max_relative_variance"),
-                    "values": way.estimate.parameters,
-                    "sigmas": way.estimate.sigma,
-                }
-                for name, way in compared.ways.items()
-            },
-            "parameters": [p.symbol for p in compared.result.parameters.values()],
-            "remarks": list(compared.remarks),
-            "warnings": list(compared.result.warnings),
-        }
-    )
+    return {
+        "max_difference_sigma": compared.max_difference_sigma,
+        "engines": {
+            name: {
+                **members(way, "wall_s", "peak_mb", "max_difference_sigma", "max_relative_variance"),
+                "values": way.estimate.parameters,
+                "sigmas": way.estimate.sigma,
+            }
+            for name, way in compared.ways.items()
+        },
+        "parameters": [p.symbol for p in compared.result.parameters.values()],
+        "remarks": compared.remarks,
+        "warnings": compared.result.warnings,
+    }
 
 
 def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
     """What ``report --json`` adds for a second evaluation: that one, and the differences from it in SI units."""
-    return clean(
-        {
-            "against": {
-                "consistent": pair.first.consistent,
-                "p_value": pair.first.test.p_value,
-                "verdict": pair.first.verdict,
-            },
-            "differences": [
-                {
-                    "symbol": difference.symbol,
-                    "first": difference.first.value,
-                    "second": difference.second.value,
-                    "sigmas": difference.sigmas,
-                    "unit": difference.first.unit,
-                }
-                for difference in pair.differences
-            ],
-            "differences_p_value": pair.p_value,
-        }
-    )
+    return {
+        "against": {
+            "consistent": pair.first.consistent,
+            "p_value": pair.first.test.p_value,
+            "verdict": pair.first.verdict,
+        },
+        "differences": [
+            {
+                "symbol": difference.symbol,
+                "first": difference.first.value,
+                "second": difference.second.value,
+                "sigmas": difference.sigmas,
+                "unit": difference.first.unit,
+            }
+            for difference in pair.differences
+        ],
+        "differences_p_value": pair.p_value,
+    }
 
 
 def members(of: object, *names: str) -> dict[str, Any]:
@@ -148,21 +139,20 @@ def members(of: object, *names: str) -> dict[str, Any]:
     return {name: getattr(of, name) for name in names}
 
 
-def clean(value: Any, digits: int | None = None) -> Any:
-    """A value in types that JSON can hold: lists and plain numbers, with null for what is not finite.
+def json_value(value: Any, digits: int | None = None) -> Any:
+    """A value in types that JSON has: a dataclass as the mapping of its fields, an array as a list, a path as its text,
+    and null for a number that is not finite.
 
     digits: significant ones of the numbers; None: all of them.
     """
-    if isinstance(value, dict):
-        return {key: clean(item, digits) for key, item in value.items()}
-    if isinstance(value, np.ndarray | list | tuple):
-        return [clean(item, digits) for item in value]
-    if isinstance(value, np.bool_ | bool):
-        return bool(value)
-    if isinstance(value, np.integer | int):
-        return int(value)
-    if isinstance(value, np.floating | float):
-        if not math.isfinite(value):
-            return None
-        return float(value if digits is None else f"{value:.{digits}g}")
-    return value
+    if hasattr(value, "tolist"):  # an array or a number of numpy
+        value = value.tolist()
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: json_value(item, digits) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(value if digits is None else f"{value:.{digits}g}") if math.isfinite(value) else None
+    return str(value) if isinstance(value, PurePath) else value

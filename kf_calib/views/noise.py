@@ -12,7 +12,7 @@ from rich.text import Text
 from kf_calib.noise.power_laws import TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
 from kf_calib.support.units import Unit, shown, significant, span
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.terminal import note, table
 
 TITLES = {
@@ -50,14 +50,12 @@ def channel_title(channel: ChannelNoise) -> str:
 
 def noise_object(noise: RestNoise) -> dict[str, Any]:
     """The JSON object of ``noise``."""
-    return clean(
-        {
-            **members(noise, "readings", "rate_hz", "rest_s", "stretches", "longest_s", "gaps"),
-            "left_out": {"moving": noise.moving, "next_to_motion": noise.settling, "unusable": noise.unusable},
-            "channels": [_channel_object(channel) for channel in noise.channels],
-            "warnings": [*noise.warnings, *remarks(noise)],
-        }
-    )
+    return {
+        **members(noise, "readings", "rate_hz", "rest_s", "stretches", "longest_s", "gaps"),
+        "left_out": {"moving": noise.moving, "next_to_motion": noise.settling, "unusable": noise.unusable},
+        "channels": [_channel_object(channel) for channel in noise.channels],
+        "warnings": [*noise.warnings, *remarks(noise)],
+    }
 
 
 def _channel_object(channel: ChannelNoise) -> dict[str, Any]:

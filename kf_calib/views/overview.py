@@ -16,7 +16,7 @@ from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.text.means import Survey
 from kf_calib.support.text import counted, cut
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.terminal import LINED, ConsoleTable, note, table
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
@@ -56,10 +56,10 @@ def overview_object(overview: Overview) -> dict[str, Any]:
     """One JSON object."""
     content = overview.content
     if isinstance(content, Inventory):
-        dwells = None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells]
+        dwells = overview.dwells
         keys = {
-            "recording": str(content.path), "format": content.format,
-            "files": [str(file) for file in content.files], "bytes": content.size,
+            "recording": content.path, "format": content.format,
+            "files": content.files, "bytes": content.size,
             "topics": [_topic_object(topic) for topic in content.topics],
         }  # fmt: skip
     else:
@@ -70,7 +70,7 @@ def overview_object(overview: Overview) -> dict[str, Any]:
             "columns": content.described_columns, "orientation": content.orientation or None,
         }  # fmt: skip
     keys |= {"bench": overview.bench, "dwells": dwells}
-    return clean(keys | members(overview, "missing", "command", "examples", "warnings"))
+    return keys | members(overview, "missing", "command", "examples", "warnings")
 
 
 def _topic_object(topic: Topic) -> dict[str, Any]:
@@ -118,7 +118,10 @@ def _recording_parts(inventory: Inventory) -> list[RenderableType]:
 def _table_parts(survey: Survey) -> list[RenderableType]:
     """Return how many rows there are, and the columns."""
     head = f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"
-    return [Text(head), _column_table(survey.described_columns)]
+    rows = [(cut(each["header"], 40), cut(each["first"], 24), _quantity(each["meaning"]),
+             _UNITS.get(each["unit"], each["unit"]), _TOLD[each["told_by"]])
+            for each in survey.described_columns]  # fmt: skip
+    return [Text(head), table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)]
 
 
 def _proposal(overview: Overview) -> str:
@@ -192,13 +195,6 @@ def pose_text(pose: Sequence[float]) -> str:
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
     return " ".join(f"{round(math.degrees(each), 2) + 0.0:.2f}°" for each in pose)
-
-
-def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
-    cells = ((each["header"], each["first"], each["meaning"], each["unit"], each["told_by"]) for each in columns)
-    rows = [(cut(header, 40), cut(first, 24), _quantity(meaning), _UNITS.get(unit, unit), _TOLD[told_by])
-            for header, first, meaning, unit, told_by in cells]  # fmt: skip
-    return table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)
 
 
 def _quantity(meaning: str) -> str:

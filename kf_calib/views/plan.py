@@ -22,7 +22,7 @@ from kf_calib.estimation.free_attitude import up_in_words
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.text import counted
 from kf_calib.support.units import Unit, shown
-from kf_calib.views.json import clean, members
+from kf_calib.views.json import members
 from kf_calib.views.notation import gimbal_names, symbol
 from kf_calib.views.terminal import FOURS, ConsoleTable, note, table
 
@@ -60,7 +60,7 @@ def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
             "plan_mean_error_percent": _by_symbol(twelve, mean_error_percent(plan.sigma[-1, :STATE_COUNT])),
             "generalised_sigma_ratio": generalised_ratio(plan),
         }
-    return clean(document)
+    return document
 
 
 def _by_symbol(symbols: Sequence[str], values: Floats | None) -> dict[str, Any] | None:
@@ -175,5 +175,11 @@ def hand_plan_report(made: HandPlan) -> RenderableType:
 def hand_plan_object(made: HandPlan) -> dict[str, Any]:
     """The JSON object of ``plan --no-angles``; sigmas in SI."""
     before, after = (_by_symbol(SYMBOLS, made.sigma[k]) for k in (0, -1))
-    return clean({"axes": None, "count": len(made.up), "gimbal_deg": None, "up": made.up, "sigma": after,
-                  "sigma_before": before})  # fmt: skip
+    return {
+        "axes": None,
+        "count": len(made.up),
+        "gimbal_deg": None,
+        "up": made.up,
+        "sigma": after,
+        "sigma_before": before,
+    }

@@ -1,8 +1,5 @@
-"""The Rich console on which results are drawn: control characters in a text never reach the terminal as commands.
-
-Tables that fit the screen: text is folded between words, and numbers are never cut, however narrow the screen is.
-
-The shape of an effect in letters: what the readings show of it and what it adds, over its own axis.
+"""The Rich console on which results are drawn, and what Rich has not: remarks, bars, tables that fit the screen, and
+plots in letters. Control characters in a text never reach the terminal as commands.
 """
 
 from __future__ import annotations
@@ -73,8 +70,8 @@ class Bar(Text):
 class ConsoleTable(rich.table.Table):
     """A table whose right-aligned columns hold numbers, which are never folded; other columns are folded between words.
 
-    Where the table does not fit, its frame is left out, then its bars. If that is not enough, each row becomes a record
-    of one or more lines, in which every cell follows the heading of its column.
+    Where the table does not fit the screen, its frame is left out, then its bars. If that is not enough, each row
+    becomes a record of one or more lines, in which every cell follows the heading of its column.
     """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

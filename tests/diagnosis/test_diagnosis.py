@@ -116,13 +116,14 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Object and report read what the diagnosis has worked out once: without its functions they say the same."""
     from kf_calib.views.console import plain
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
+    from kf_calib.views.json import json_value
 
     found = unlisted()
-    shown, printed = diagnosis_object(found), plain(diagnosis_report(found, details=True))
+    shown, printed = json_value(diagnosis_object(found)), plain(diagnosis_report(found, details=True))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
     for name in ("describe_irregular", "detectable", "advise", "mean_covariances"):
         monkeypatch.delattr(results, name)
-    assert diagnosis_object(found) == shown and plain(diagnosis_report(found, details=True)) == printed
+    assert json_value(diagnosis_object(found)) == shown and plain(diagnosis_report(found, details=True)) == printed
 
 
 @pytest.mark.slow

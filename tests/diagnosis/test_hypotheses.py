@@ -25,6 +25,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.sources.files.recording import Recording
 from kf_calib.support.tail_probabilities import log_odds_of
 from kf_calib.views.diagnosis import diagnosis_object
+from kf_calib.views.json import json_value
 
 FAMILIES = {
     "bias in time", "scale in time", "temperature", "nonlinearity", "cross-axis", "memory", "gimbal and encoder",
@@ -106,7 +107,7 @@ def test_every_effect_has_a_family() -> None:
 @pytest.mark.slow
 def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
     found = diagnosed("encoder-harmonic-1:z=15sigma")
-    said = diagnosis_object(found)
+    said = json_value(diagnosis_object(found))
     first = said["hypotheses"][0]
     assert first["effects"] == ["encoder-harmonic-1:z"] and first["formula"] is None
     assert said["families"][0] == {"family": "gimbal and encoder", "probability": pytest.approx(1.0, abs=0.02)}

@@ -14,7 +14,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
 from kf_calib.views import console
 from kf_calib.views.diagnosis import diagnosis_report
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live import objects
 from kf_calib.views.rerun.series import ORIENTATION, VisitHistory, ends
 
@@ -45,7 +45,7 @@ def test_visits_are_numbered_from_one(result: Calibration) -> None:
 
 def test_findings_name_dwells_by_these_numbers(result: Calibration) -> None:
     assert result.readings.outliers.dwells == (8,)
-    assert replay_object(result)["readings"]["outliers"]["dwells"] == [8]
+    assert json_value(replay_object(result))["readings"]["outliers"]["dwells"] == [8]
     assert any("crowded in dwell 8 " in warning for warning in result.warnings)
 
 

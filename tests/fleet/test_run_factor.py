@@ -7,9 +7,10 @@ import pytest
 from helpers.hidden_effects import noisy_run
 
 import kf_calib
+from kf_calib.bench.paper_parameters import STATES
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation import square_root_information
-from kf_calib.fleet.run_factor import STATES, run_factor
+from kf_calib.fleet.run_factor import run_factor
 
 ROOT = Path(__file__).resolve().parents[2]
 

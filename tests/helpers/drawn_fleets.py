@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.run_factor import STATES, RunFactor
+from kf_calib.bench.paper_parameters import STATES
+from kf_calib.fleet.run_factor import RunFactor
 
 SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "flexure": ("dX", "dY", "dZ"),

@@ -27,7 +27,7 @@ from kf_calib.online.status import Judgement, RunStatus
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import opened
 from kf_calib.views.exchange import verification_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live.objects import live_object
 
 printed = CommandLine().json
@@ -86,7 +86,7 @@ def uses(folder: Path) -> Mapping[str, Any]:
     certified = ("certificate", paths[0], "--statement", lab, "--xml", folder / "c.xml", "-o", folder / "c.pdf")
     told = {
         "history": printed("history", *paths, "--tolerance", "K=20ppm", "--tolerance", "b=100ug"),
-        "verify": verification_object(verified), "certificate": printed(*certified),
+        "verify": json_value(verification_object(verified)), "certificate": printed(*certified),
         "saved": json.loads(paths[0].read_text()), "figures": ResultNumbers().add(verified, "verify").figures,
     }  # fmt: skip
     return told | {f"export {to}": exported(paths[0], to, folder / f"export-{to}") for to in TARGETS}
@@ -109,7 +109,7 @@ def readers(folder: Path) -> Mapping[str, Any]:
     told["bench_bag"] = streams(read(Recording(RECORDINGS / "bench_bag", BAG)))
     poses = calibrate(opened(RECORDINGS / "twelve_poses.csv", BAG))
     faces = calibrate(opened(RECORDINGS / "six_faces.xlsx", {"gravity_mps2": "9.81"}))
-    return told | {"poses": replay_object(poses), "faces": replay_object(faces)}
+    return told | json_value({"poses": replay_object(poses), "faces": replay_object(faces)})
 
 
 def streams(batch: Batch) -> Mapping[str, Any]:
@@ -132,7 +132,7 @@ def live(folder: Path) -> Mapping[str, Any]:
 
 def of_judgement(judged: Judgement, standing: RunStatus) -> Mapping[str, Any]:
     """What ``live`` says beside what ``replay`` and ``diagnose`` do, and the largest of what they say."""
-    told = live_object(judged, standing, None)
+    told = json_value(live_object(judged, standing, None))
     return {key: told[key] for key in ("p_value", "consistent", "looks", "time_left_s", "next_orientation", "model")}
 
 

@@ -23,6 +23,7 @@ from kf_calib.fleet.text import pooled_objects
 from kf_calib.noise import allan, banded, noise_of_readings, random_walk
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning import loop
+from kf_calib.views.json import json_value
 
 Numbers = Mapping[str, Any]
 SIZES = np.geomspace(1e-3, 1e3, 40)
@@ -201,7 +202,7 @@ def fleets() -> Numbers:
     plans = (Plan(12, 2, 2, 4), Plan(9, 3, 2, 9, 0.0, 5.0, 0.5, 0.0, 0.0), Plan(8, 1, 3, 0, 2.0, mean=0.0))
     for number, plan in enumerate(plans):
         found = pooled_diagnosis(drawn_fleet(plan, np.random.default_rng(number)).runs)
-        told[f"fleet {number}"] = pooled_objects(found)
+        told[f"fleet {number}"] = json_value(pooled_objects(found))
         numbers.add(found, f"fleet {number}")
     return told | {"figures": numbers.figures}
 

@@ -17,7 +17,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.views.diagnosis import diagnosis_object
 from kf_calib.views.improvement import improvement_object
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 
 Numbers = Mapping[str, Any]
 """What is stored of a case: a tree for each command, and the figures of all of the result."""
@@ -25,19 +25,19 @@ Numbers = Mapping[str, Any]
 
 def of_calibration(result: Calibration) -> Numbers:
     """Of ``replay``."""
-    return {"replay": replay_object(result), "figures": ResultNumbers().add(result, "replay").figures}
+    return {"replay": json_value(replay_object(result)), "figures": ResultNumbers().add(result, "replay").figures}
 
 
 def of_diagnosis(diagnosis: Diagnosis) -> Numbers:
     """Of ``replay`` and ``diagnose``."""
     told = {"replay": replay_object(diagnosis.before), "diagnose": diagnosis_object(diagnosis)}
-    return told | {"figures": ResultNumbers().add(diagnosis, "diagnose").figures}
+    return json_value(told) | {"figures": ResultNumbers().add(diagnosis, "diagnose").figures}
 
 
 def of_improvement(improvement: Improvement) -> Numbers:
     """Of ``improve``."""
     told = {"improve": improvement_object(improvement, None, {})}
-    return told | {"figures": ResultNumbers().add(improvement, "improve").figures}
+    return json_value(told) | {"figures": ResultNumbers().add(improvement, "improve").figures}
 
 
 def simulated(query: str, **keys: str) -> Source:

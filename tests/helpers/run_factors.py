@@ -5,9 +5,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATES
 from kf_calib.dwells.qr import triangle
 from kf_calib.fleet.campaign import Group
-from kf_calib.fleet.run_factor import STATES, RunFactor
+from kf_calib.fleet.run_factor import RunFactor
 
 EFFECTS: Mapping[str, tuple[str, ...]] = {
     "second-order": ("K2_1", "K2_2", "K2_3"),

@@ -28,7 +28,7 @@ from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
 from kf_calib.sources.simulation.settings import SimulationOptions
 from kf_calib.views.console import plain
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live.content import content_of
 from kf_calib.views.live.objects import line, live_object
 from kf_calib.views.live.screen import screen
@@ -111,7 +111,7 @@ def test_the_end_is_that_of_replay_and_each_pose_is_judged() -> None:
     replayed = calibrate(told.session.source)
     assert final.final and final.result is not None and not final.result.model.square
     np.testing.assert_array_equal(final.result.estimate.state, replayed.estimate.state)
-    assert replay_object(final.result) == replay_object(replayed)
+    assert json_value(replay_object(final.result)) == json_value(replay_object(replayed))
     assert [len(each.dwells) for each in told.judged] == [*range(1, 13), 12]
     assert final.reached and final.consistent is True and final.sides.count == 11
 

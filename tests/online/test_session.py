@@ -53,7 +53,7 @@ from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
-from kf_calib.views.json import replay_object
+from kf_calib.views.json import json_value, replay_object
 from kf_calib.views.live import objects
 from kf_calib.views.live.content import Doing, content_of
 from kf_calib.views.live.screen import screen
@@ -114,7 +114,7 @@ def equal(one: Judgement, settings: Settings, source: Simulation | Run) -> None:
     replayed = calibrate(source, settings)
     for name in ("state", "covariance"):
         np.testing.assert_array_equal(getattr(one.result.estimate, name), getattr(replayed.estimate, name))
-    assert replay_object(one.result) == replay_object(replayed)
+    assert json_value(replay_object(one.result)) == json_value(replay_object(replayed))
     assert one.diagnosis.verdict == diagnose(replayed).verdict
 
 

@@ -1,8 +1,5 @@
-"""A calibration as it converges: sigmas and estimates after each orientation, NIS and innovations beside noise.
-
-A panel a parameter: a column an accelerometer, rows of angles, scale factors and biases; below, effects.
-
-The calibrations of one block over time: a control chart of each parameter, as the filter sees it.
+"""The filter from orientation to orientation: sigmas and estimates (a panel a parameter: a column an accelerometer,
+rows of angles, scale factors and biases; below, effects), NIS and innovations; and from calibration to calibration.
 """
 
 from __future__ import annotations
@@ -41,7 +38,7 @@ from kf_calib.views.figures.style import (
     say_within,
     whole_numbers,
 )
-from kf_calib.views.notation import Shown, symbol, twelve, with_coefficients, written
+from kf_calib.views.notation import Shown, signed, symbol, twelve, with_coefficients, written
 
 MANY = 60
 """Dwells, above which curves have no markers."""
@@ -241,7 +238,7 @@ def _ending(history: ParameterHistory, k: int, name: Shown) -> str:
     if parameter.value is None or parameter.sigma is None:
         return f"{name.label} not determined"
     off, sigma = rounded((parameter.value - parameter.nominal) * name.per_si, parameter.sigma * name.per_si)
-    return f"{name.label} {'' if off.startswith('-') else '+'}{off} ± {sigma} {name.unit}".replace("-", "−")
+    return f"{name.label} {signed(off)} ± {sigma} {name.unit}".replace("-", "−")
 
 
 _AHEAD = 0.5  # of the time from the first to the last calibration, if no later date is asked for

@@ -1,8 +1,5 @@
-"""What a misfit may be, and with what probability: families of effects, and below them single explanations.
-
-Which effect is missing: what each suspect explains, which of them are alike, and where they would be told apart.
-
-What could hide in a run: the smallest detectable size of each effect against usual sizes, and what is not seen.
+"""What a misfit may be: families of effects and single explanations with their probabilities, what each suspect
+explains, which are alike and where they would be told apart, and what could hide in the run unseen.
 """
 
 from __future__ import annotations

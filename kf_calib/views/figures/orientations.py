@@ -1,10 +1,5 @@
-"""A plan of orientations: where specific force will point in the platform, in order, and the sigmas to expect.
-
-Directions of gravity in the platform on a map of the sphere: Mollweide's, which keeps areas; the y axis is up.
-
-Residuals on the sphere of directions of gravity in the platform.
-
-What each orientation brought of the information about every parameter, and the correlations at the end.
+"""Orientations: those of a plan with the sigmas to expect, those of a run with what each left and brought. Directions
+of gravity in the platform are on maps of the sphere, Mollweide's, which keeps areas.
 """
 
 from __future__ import annotations
@@ -48,7 +43,7 @@ _LEAST = 3.0  # sigmas at the ends of the colours, at least
 
 
 def sphere_map(figure: FigureBase, place: tuple[int, int, int]) -> Axes:
-    """An empty map of the sphere in a place of a grid, with the platform's axes named."""
+    """An empty map of the sphere in a place of a grid, with the platform's axes named; the y axis is up."""
     axes = figure.add_subplot(*place, projection="mollweide")
     axes.set_xticks(np.radians([-150, -90, -30, 30, 90, 150]), [""] * 6)
     axes.set_yticks(np.radians([-60, -30, 0, 30, 60]), [""] * 5)

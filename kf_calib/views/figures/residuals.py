@@ -1,6 +1,5 @@
-"""Where the model fails: residuals against what they go with, what explanations predict of them, and what is left.
-
-One dwell reading by reading: readings less what the model says, and their mean with its sigma.
+"""Where the model fails: residuals against what they go with, what explanations predict of them, and what is left; of
+all dwells, and of one reading by reading.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""What all figures share: size, fonts, colours that colour-blind eyes tell apart, and how they become files.
-
-Figures are matplotlib's, on white, for a report; they need no screen, no viewer and no graphics driver.
-
-Axes that can be read: logarithms with their values as labels, orientations as whole numbers.
+"""What all figures share: size, fonts, colours that colour-blind eyes tell apart, axes that can be read, and how they
+become files. They are matplotlib's, on white, for a report; they need no screen, no viewer and no graphics driver.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from kf_calib.online.status import Judgement
 from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.diagnosis import found_object, orientation_object
-from kf_calib.views.json import clean, members, replay_object
+from kf_calib.views.json import members, replay_object
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -33,14 +32,14 @@ def live_object(judgement: Judgement | HandJudgement, standing: Progress, status
         "standing": judgement.verdict,
         "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
         "notice": standing.notice,
-        "source": None if status is None else asdict(status),
+        "source": status,
     }
     if isinstance(judgement, Judgement):
         known, further = found_object(judgement.diagnosis) | replay_object(judgement.result), _of_bench(judgement)
     else:
         counts = {"samples": standing.samples, "dwells": len(judgement.dwells)}
         known, further = replay_object(judgement.result) if judgement.result else counts, _of_hand(judgement)
-    return known | clean(of_live | further)
+    return known | of_live | further
 
 
 def _of_bench(judgement: Judgement) -> dict[str, Any]:
@@ -75,7 +74,7 @@ def _going(judgement: Judgement) -> dict[str, Any] | None:
     if judgement.advice is not None:
         return orientation_object(*judgement.advice)
     going = None if judgement.final else judgement.next_orientation
-    return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
+    return None if going is None else {"gimbal_deg": going[0], "stay_s": None, "why": going[1]}
 
 
 def line(judgement: Judgement | HandJudgement) -> str:

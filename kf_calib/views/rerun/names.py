@@ -1,8 +1,7 @@
-"""What the panels share: timelines, colours, labels and units.
+"""What the panels share: timelines, colours, labels, units, and how an .rrd file is written, whole or not at all.
 
-They share how an .rrd file is written, whole or not at all, too. Rerun's own way to a file waits for ever where the
-disk is full, and raises nothing where it could not write: here it encodes in memory (a view has a few MB), and what it
-encoded is written as every other output is.
+Rerun's own way to a file waits for ever where the disk is full, and raises nothing where it could not write: here it
+encodes in memory (a view has a few MB), and what it encoded is written as every other output is.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Residuals on spheres of the directions of gravity, an accelerometer each, beside its sensitive axis.
-
-The platform frame in 3-D: the sensitive axes stand still in it, gravity moves from dwell to dwell.
+"""What is in three dimensions: residuals on spheres of the directions of gravity, and the platform, in whose frame the
+sensitive axes stand still and gravity moves from dwell to dwell.
 
 Ellipsoids of 1 sigma sit at the tips of the axes, magnified by one factor for the whole run, with a bar that shows the
 scale; the first ones stay as wires, so that the others are seen to shrink. Along the axis they have the scale factor's
