@@ -88,11 +88,13 @@ class RunTerm:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; squares (n, m) of their sizes, logs
-    (n, m) of their probabilities, and centres (n,)."""
+    """Terms of q columns: their numbers (n,), the different sets (s, q) of columns that they have, which of these (n,)
+    is that of each, and factors (n, q) of its columns; squares (n, m) of their sizes, logs (n, m) of their
+    probabilities, and centres (n,)."""
 
     numbers: Indices
     places: Indices
+    which: Indices
     scales: Floats
     squares: Floats
     log_weights: Floats
@@ -302,9 +304,10 @@ class RunTerms:
             numbers = np.flatnonzero(widths == width)
             terms = [self.terms[k] for k in numbers.tolist()]
             sizes, unit = [term.sizes for term in terms], np.ones(width)
+            places, which = np.unique([term.columns for term in terms], axis=0, return_inverse=True)
             alike.append(
                 _Alike(
-                    numbers, np.array([term.columns for term in terms]),
+                    numbers, places, which,
                     np.array([unit if term.scales is None else term.scales for term in terms]),
                     np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
                     np.array([each.centre for each in sizes]),
@@ -325,14 +328,15 @@ class RunTerms:
         logs, every = np.zeros((len(self.terms), len(sizes))), slice(None)
         for alike, grams, lengths in zip(self._alike, noises.grams, noises.lengths, strict=True):
             few = every if some is None else some[alike.numbers]
-            places, scales = alike.places[few], alike.scales[few]
-            gram, along = grams[sizes][:, few], noises.along[sizes][:, places]
+            which, scales = alike.which[few], alike.scales[few]
+            places = alike.places[which]
+            gram, along = grams[np.ix_(sizes, which)], noises.along[sizes][:, places]
             if explained is not None:
                 parts = np.moveaxis(explained[..., places], 1, 3)  # (K, n, q, f)
                 gram -= parts @ np.swapaxes(parts, 2, 3)
                 along -= (parts @ explained[:, None, :, -1:])[..., 0]
             gram, along = gram * scales[:, :, None] * scales[:, None], along * scales
-            length = lengths[sizes][:, few] * scales.max(axis=1) ** 2
+            length = lengths[np.ix_(sizes, which)] * scales.max(axis=1) ** 2
             of_sizes = alike.squares[few], alike.log_weights[few], alike.centres[few]
             logs[alike.numbers[few]] = log_bayes(gram, along, *of_sizes, length).T
         return logs
