@@ -262,6 +262,16 @@ def _off(
     return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)
 
 
+def _eigen(gram: Floats, lengths: Floats | None) -> tuple[Floats, Floats, Floats]:
+    """Return the roots (..., n) of the largest squares of columns, and the eigenvalues (..., n, q) and vectors
+    (..., n, q, q) of gram (..., n, q, q) in units of these squares; arguments as of ``log_bayes``."""
+    largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
+    scales = np.sqrt(np.maximum(largest, 1e-300))
+    scaled = gram / scales[..., None, None] ** 2
+    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
+    return scales, np.where(values > ROUNDING, values, 0.0), vectors
+
+
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,
               lengths: Floats | None = None) -> Floats:  # fmt: skip
     """Log Bayes factors (..., n) of n terms of q columns, in several noises or one: gram (..., n, q, q) and along
@@ -270,11 +280,7 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
 
     lengths: the largest squares (..., n) of columns before others were subtracted from them; None: those of gram.
     """
-    largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
-    scales = np.sqrt(np.maximum(largest, 1e-300))
-    scaled = gram / scales[..., None, None] ** 2
-    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
-    values = np.where(values > ROUNDING, values, 0.0)
+    scales, values, vectors = _eigen(gram, lengths)
     shifted, shift = along, 0.0
     if centres.any():
         shifted = along - gram.sum(axis=-1) * centres[:, None]
@@ -290,6 +296,44 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
             volume *= spread
         log_volume += np.log(volume)
     return log_of_sum(log_weights + 0.5 * (squares * gained - log_volume)) + shift
+
+
+def orthonormal_columns(gram: Floats, along: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
+    """The orthonormal columns U that the columns G of terms are turned to: the squares (..., n, q) L of those of which
+    they are a part, G = U L^(1/2) T^T, the matrices T L^(-1/2) (..., n, q, q), and U^T z (..., n, q); arguments as of
+    ``log_bayes``."""
+    scales, values, vectors = _eigen(gram, lengths)
+    units = np.where(values > 0.0, 1.0 / np.sqrt(np.where(values > 0.0, values, 1.0)), 0.0) / scales[..., None]
+    turns = vectors * units[..., None, :]
+    return values * scales[..., None] ** 2, turns, (along[..., None, :] @ turns)[..., 0, :]
+
+
+def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: Floats, readings: Floats,
+                     squares: Floats, log_weights: Floats) -> Floats:  # fmt: skip
+    """The same beside f columns of any size, of which B is an orthonormal basis: explained (K, n, q, f) = G^T B and
+    readings (K, f) = B^T z; squared, turns and along are the terms' ``orthonormal_columns``.
+
+    With V = I + s^2 G G^T, M = B^T V^-1 B = (I - B^T U U^T B) + B^T U (I + s^2 L)^-1 U^T B and h = B^T V^-1 z it is
+
+      1/2 (z^T (I - V^-1) z + h^T M^-1 h - |B^T z|^2) - 1/2 log det V - 1/2 log det M,
+
+    so that for each size there is a matrix of f rows only.
+    """
+    common = np.swapaxes(turns, -1, -2) @ explained
+    apart, axes = np.linalg.eigh(np.eye(common.shape[-1]) - np.swapaxes(common, -1, -2) @ common)
+    common, readings = common @ axes, (readings[:, None, None] @ axes)[..., 0, :]
+    left = 1.0 / (1.0 + squares[..., None] * squared[..., None, :])
+    pairs = (common[..., None] * common[..., None, :]).reshape(*common.shape[:-1], common.shape[-1] ** 2)
+    matrices = (left @ pairs).reshape(*left.shape[:-1], *axes.shape[-2:])
+    matrices += (np.maximum(apart, 0.0)[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
+    of_rest = readings - (along[..., None, :] @ common)[..., 0, :]
+    right = of_rest[..., None, :] + left @ (common * along[..., None])
+    roots = np.linalg.cholesky(matrices)
+    gained = np.sum(np.linalg.solve(roots, right[..., None])[..., 0] ** 2, axis=-1)
+    gained += (np.sum(along**2, axis=-1) - np.sum(readings**2, axis=-1))[..., None]
+    gained -= (left @ along[..., None] ** 2)[..., 0]
+    log_volume = 2.0 * np.log(np.einsum("...ff->...f", roots)).sum(axis=-1) - np.log(left).sum(axis=-1)
+    return log_of_sum(log_weights + 0.5 * (gained - log_volume))
 
 
 def log_of_sum(logs: Floats) -> Floats:
