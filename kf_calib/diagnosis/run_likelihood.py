@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.bench.arrays import AT_ONCE, Floats, Indices
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
@@ -105,7 +105,7 @@ class RunLikelihood:
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
-        self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(combined**2, axis=0))
+        self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", combined, combined))
         more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
         self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
@@ -159,7 +159,7 @@ class RunLikelihood:
     def lengths_left(self) -> Floats:
         """Lengths (C,) of the columns of the terms off the model."""
         columns, more = self.spanned.columns, self.spanned.more_columns
-        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(more**2, axis=0))
+        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", more, more))
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
@@ -256,7 +256,8 @@ def _off(
     onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
     for k in range(len(columns)):
         columns[k] -= of_means[k] @ onto
-    more_columns -= more @ onto
+    for few in (slice(k, k + AT_ONCE // 8) for k in range(0, len(more), AT_ONCE // 8)):
+        more_columns[few] -= more[few] @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
     # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain
     return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)

@@ -365,10 +365,10 @@ class RunTerms:
         squares (K, n) of their columns."""
         alike = self._alike[number]
         which, scales = alike.which[few], alike.scales[few]
-        of_sizes = np.array(sizes)[:, None]
-        gram = noises.grams[number][of_sizes, which] * scales[:, :, None] * scales[:, None]
+        of_sizes = np.array(sizes)
+        gram = noises.gram(number, of_sizes, which) * scales[:, :, None] * scales[:, None]
         along = noises.along[sizes][:, alike.places[which]] * scales
-        return gram, along, noises.lengths[number][of_sizes, which] * scales.max(axis=1) ** 2
+        return gram, along, noises.lengths[number][of_sizes[:, None], which] * scales.max(axis=1) ** 2
 
     def _decomposed(self, noises: InNoises, number: int, size: int) -> tuple[Floats, Floats, Floats]:
         """Return the terms that are alike turned to orthogonal columns in noise of one size, made once for all that

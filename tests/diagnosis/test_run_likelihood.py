@@ -149,7 +149,7 @@ def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterio
     noises = likelihood.in_noises(posterior._sizes.families[2].shapes, posterior._sizes.squares, [PLACES])
     for k in (0, 5, len(posterior._sizes.squares) - 1):
         rows = likelihood.projected(posterior._sizes.squares[k] * posterior._sizes.families[2].shapes, PLACES.ravel())
-        for gram, place in zip(noises.grams[0][k], PLACES, strict=True):
+        for gram, place in zip(noises.gram(0, np.array([k]), np.arange(len(PLACES)))[0], PLACES, strict=True):
             columns = rows.of(place)
             np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-6, atol=1e-9 * np.abs(gram).max())
             np.testing.assert_allclose(noises.along[k, place], columns.T @ rows.readings, rtol=1e-6, atol=1e-6)
