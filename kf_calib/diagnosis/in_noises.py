@@ -77,7 +77,7 @@ class InNoises:
     groups: columns (n, q) of the terms of each group.
 
     - logs (K,): log of the restricted likelihood without any term.
-    - grams: of each group, G^T W G (K, n, q, q). along (K, C): G^T W z. Both are projected off the model.
+    - along (K, C): G^T W z, projected off the model.
     - lengths: of each group, the largest squares (K, n) of columns that were not projected.
     """
 
@@ -103,21 +103,29 @@ class InNoises:
         self.along, chi2 = rest[:, :-1], rest[:, -1]
         log_model = np.log(np.einsum("kpp->kp", self._inverse)).sum(axis=1)
         self.logs = rows.log + 0.5 * np.log(self._weights).sum(axis=(1, 2)) + log_model - 0.5 * chi2
-        both = [self._gram(group, summed) for group, summed in zip(groups, sums, strict=True)]
-        self.grams, self.lengths = [gram for gram, _ in both], [length for _, length in both]
+        self._groups, self._products = groups, sums
+        self.lengths = [self._project(group, summed) for group, summed in zip(groups, sums, strict=True)]
 
-    def _gram(self, group: Indices, sums: Floats) -> tuple[Floats, Floats]:
-        """Return G^T W G (K, n, q, q) of a group from the sums (K, n, pairs) of its products, projected, and the
-        largest squares (K, n) on its diagonal before."""
-        count, width = group.shape
+    def _project(self, group: Indices, sums: Floats) -> Floats:
+        """Project the sums (K, n, pairs) of the products of a group, and return the largest squares (K, n) before."""
+        first, second = np.triu_indices(group.shape[1])
+        most = max(8 * IN_CACHE // max(len(self._rows.more_columns) * group.shape[1], 1), 1)
+        for few in (slice(k, k + most) for k in range(0, len(group), most)):
+            more = np.swapaxes(self._rows.more_columns.T[group[few]], 1, 2)
+            sums[:, few] += (np.swapaxes(more, 1, 2) @ more)[:, first, second]
+        lengths = sums[..., first == second].max(axis=2)
+        for of_size, off in zip(sums, self._off, strict=True):
+            along = np.swapaxes(off.T[group], 1, 2)  # (n, k, q)
+            of_size -= (np.swapaxes(along, 1, 2) @ along)[:, first, second]
+        return lengths
+
+    def gram(self, number: int, sizes: Indices, which: Indices) -> Floats:
+        """G^T W G (K, n, q, q) of some of a group's terms, projected off the model, in some of the sizes."""
+        width = self._groups[number].shape[1]
         first, second = np.triu_indices(width)
-        more = np.swapaxes(self._rows.more_columns.T[group], 1, 2)
-        gram = np.empty((len(sums), count, width, width))
-        gram[..., first, second] = gram[..., second, first] = sums
-        gram += np.swapaxes(more, 1, 2) @ more
-        lengths = np.einsum("knqq->knq", gram).max(axis=2)
-        off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
-        return gram - np.swapaxes(off, 2, 3) @ off, lengths
+        gram = np.empty((len(sizes), len(which), width, width))
+        gram[..., first, second] = gram[..., second, first] = self._products[number][sizes[:, None], which]
+        return gram
 
     def __len__(self) -> int:
         return len(self.logs)
@@ -166,7 +174,8 @@ class InNoises:
 
     def _parts(self) -> list[slice]:
         """Return few dwells at a time."""
-        most = max(8 * IN_CACHE // (3 * (self._rows.columns.shape[2] + 1)), 1)
+        widest = max(self._rows.columns.shape[2], len(self._weights) * self._spanned) + 1
+        most = max(8 * IN_CACHE // (3 * widest), 1)
         return [slice(k, k + most) for k in range(0, len(self._rows), most)]
 
     def _of_rows(self, part: slice) -> Floats:

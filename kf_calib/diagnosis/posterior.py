@@ -68,6 +68,7 @@ _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _NODES_OF_PAIR = 16  # sizes of each of two effects
 _ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
+_AT_ONCE = 8  # sizes of noise, of which the products of all columns are copied
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 
@@ -170,7 +171,9 @@ class RunPosterior:
     @cached_property
     def _log_bayes(self) -> Floats:
         """Log Bayes factors (terms, noises) of all terms."""
-        return np.hstack([self._run.log_bayes(noises, range(len(noises.logs))) for noises in self._noises])
+        few = [(noises, range(len(noises))[k : k + _AT_ONCE]) for noises in self._noises
+               for k in range(0, len(noises), _AT_ONCE)]  # fmt: skip
+        return np.hstack([self._run.log_bayes(noises, sizes) for noises, sizes in few])
 
     @cached_property
     def _log_evidence(self) -> Floats:
@@ -557,7 +560,8 @@ class RunPosterior:
             likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
             every = np.arange(refit.model.count - known)
             noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
-            parts = [(of_family.logs, of_family.grams[0][:, 0], of_family.along[:, every]) for of_family in noises]
+            one = np.zeros(1, np.intp)
+            parts = [(own.logs, own.gram(0, np.arange(len(own)), one)[:, 0], own.along[:, every]) for own in noises]
             logs, grams, along = (np.concatenate(part) for part in zip(*parts, strict=True))
             self._of_refits[key] = likelihood, logs, grams, along
         return self._of_refits[key]

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.bench.arrays import AT_ONCE, Floats, Indices
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
@@ -36,6 +36,7 @@ _FINE = 8  # parts of a step over which the likelihood is integrated
 _FAR = 300.0  # in log likelihood, below the largest: a polynomial through values that differ by more swings out
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
+_FACTORS = 8  # of which a product is a double, whatever the sizes
 
 _NONE = np.zeros(0)
 
@@ -104,7 +105,7 @@ class RunLikelihood:
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
-        self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(combined**2, axis=0))
+        self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", combined, combined))
         more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
         self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
@@ -158,7 +159,7 @@ class RunLikelihood:
     def lengths_left(self) -> Floats:
         """Lengths (C,) of the columns of the terms off the model."""
         columns, more = self.spanned.columns, self.spanned.more_columns
-        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(more**2, axis=0))
+        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", more, more))
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
@@ -268,10 +269,21 @@ def _off(
     onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
     for k in range(len(columns)):
         columns[k] -= of_means[k] @ onto
-    more_columns -= more @ onto
+    for few in (slice(k, k + AT_ONCE // 8) for k in range(0, len(more), AT_ONCE // 8)):
+        more_columns[few] -= more[few] @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
     # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain
     return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)
+
+
+def _eigen(gram: Floats, lengths: Floats | None) -> tuple[Floats, Floats, Floats]:
+    """Return the roots (..., n) of the largest squares of columns, and the eigenvalues (..., n, q) and vectors
+    (..., n, q, q) of gram (..., n, q, q) in units of these squares; arguments as of ``log_bayes``."""
+    largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
+    scales = np.sqrt(np.maximum(largest, 1e-300))
+    scaled = gram / scales[..., None, None] ** 2
+    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
+    return scales, np.where(values > ROUNDING, values, 0.0), vectors
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,
@@ -282,22 +294,67 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
 
     lengths: the largest squares (..., n) of columns before others were subtracted from them; None: those of gram.
     """
-    largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
-    scales = np.sqrt(np.maximum(largest, 1e-300))
-    scaled = gram / scales[..., None, None] ** 2
-    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
-    values = np.where(values > ROUNDING, values, 0.0)
+    scales, values, vectors = _eigen(gram, lengths)
     shifted, shift = along, 0.0
     if centres.any():
         shifted = along - gram.sum(axis=-1) * centres[:, None]
         shift = along.sum(axis=-1) * centres - 0.5 * gram.sum(axis=(-2, -1)) * centres**2
     turned = ((shifted / scales[..., None])[..., None, :] @ vectors)[..., 0, :] ** 2 * (values > 0.0)
     squares = squares * scales[..., None] ** 2
-    logs = log_weights + np.zeros_like(squares)
-    for k in range(values.shape[-1]):
-        spread = squares * values[..., k, None]
-        logs += 0.5 * (squares * turned[..., k, None] / (1.0 + spread) - np.log1p(spread))
-    return np.logaddexp.reduce(logs, axis=-1) + shift
+    gained, log_volume = np.zeros_like(squares), np.zeros_like(squares)
+    for first in range(0, values.shape[-1], _FACTORS):
+        volume = np.ones_like(squares)
+        for k in range(first, min(first + _FACTORS, values.shape[-1])):
+            spread = 1.0 + squares * values[..., k, None]
+            gained += turned[..., k, None] / spread
+            volume *= spread
+        log_volume += np.log(volume)
+    return log_of_sum(log_weights + 0.5 * (squares * gained - log_volume)) + shift
+
+
+def orthonormal_columns(gram: Floats, along: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
+    """The orthonormal columns U that the columns G of terms are turned to: the squares (..., n, q) L of those of which
+    they are a part, G = U L^(1/2) T^T, the matrices T L^(-1/2) (..., n, q, q), and U^T z (..., n, q); arguments as of
+    ``log_bayes``."""
+    scales, values, vectors = _eigen(gram, lengths)
+    units = np.where(values > 0.0, 1.0 / np.sqrt(np.where(values > 0.0, values, 1.0)), 0.0) / scales[..., None]
+    turns = vectors * units[..., None, :]
+    return values * scales[..., None] ** 2, turns, (along[..., None, :] @ turns)[..., 0, :]
+
+
+def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: Floats, readings: Floats,
+                     squares: Floats, log_weights: Floats) -> Floats:  # fmt: skip
+    """The same beside f columns of any size, of which B is an orthonormal basis: explained (K, n, q, f) = G^T B and
+    readings (K, f) = B^T z; squared, turns and along are the terms' ``orthonormal_columns``.
+
+    With V = I + s^2 G G^T, M = B^T V^-1 B = (I - B^T U U^T B) + B^T U (I + s^2 L)^-1 U^T B and h = B^T V^-1 z it is
+
+      1/2 (z^T (I - V^-1) z + h^T M^-1 h - |B^T z|^2) - 1/2 log det V - 1/2 log det M,
+
+    so that for each size there is a matrix of f rows only.
+    """
+    common = np.swapaxes(turns, -1, -2) @ explained
+    apart, axes = np.linalg.eigh(np.eye(common.shape[-1]) - np.swapaxes(common, -1, -2) @ common)
+    common, readings = common @ axes, (readings[:, None, None] @ axes)[..., 0, :]
+    left = 1.0 / (1.0 + squares[..., None] * squared[..., None, :])
+    pairs = (common[..., None] * common[..., None, :]).reshape(*common.shape[:-1], common.shape[-1] ** 2)
+    matrices = (left @ pairs).reshape(*left.shape[:-1], *axes.shape[-2:])
+    matrices += (np.maximum(apart, 0.0)[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
+    of_rest = readings - (along[..., None, :] @ common)[..., 0, :]
+    right = of_rest[..., None, :] + left @ (common * along[..., None])
+    roots = np.linalg.cholesky(matrices)
+    gained = np.sum(np.linalg.solve(roots, right[..., None])[..., 0] ** 2, axis=-1)
+    gained += (np.sum(along**2, axis=-1) - np.sum(readings**2, axis=-1))[..., None]
+    gained -= (left @ along[..., None] ** 2)[..., 0]
+    log_volume = 2.0 * np.log(np.einsum("...ff->...f", roots)).sum(axis=-1) - np.log(left).sum(axis=-1)
+    return log_of_sum(log_weights + 0.5 * (gained - log_volume))
+
+
+def log_of_sum(logs: Floats) -> Floats:
+    """Log (...) of the sum of exp(logs) over the last axis (..., m); numpy's ``logaddexp`` takes several times as
+    long."""
+    largest = logs.max(axis=-1, keepdims=True)
+    return np.asarray(largest[..., 0] + np.log(np.exp(logs - largest).sum(axis=-1)), float)
 
 
 def log_bayes_together(gram: Floats, along: Floats, widths: Sequence[int], sizes: Sequence[Sizes]) -> Floats:

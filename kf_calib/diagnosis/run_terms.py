@@ -17,7 +17,14 @@ from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.diagnosis.candidate_tests import GRID, CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
-from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
+from kf_calib.diagnosis.run_likelihood import (
+    Combination,
+    RunLikelihood,
+    Sizes,
+    log_bayes,
+    log_bayes_beside,
+    orthonormal_columns,
+)
 from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.diagnosis.within_rows import Courses, log_bayes_by_size
 from kf_calib.dwells.qr import orthonormal
@@ -40,6 +47,7 @@ _LEAST = 1e-3  # share of the largest part of a term that a part of it has at le
 _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, up to two a dwell, and of what is smooth
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
+_WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
 """All columns of a term."""
@@ -88,11 +96,13 @@ class RunTerm:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; squares (n, m) of their sizes, logs
-    (n, m) of their probabilities, and centres (n,)."""
+    """Terms of q columns: their numbers (n,), the different sets (s, q) of columns that they have, which of these (n,)
+    is that of each, and factors (n, q) of its columns; squares (n, m) of their sizes, logs (n, m) of their
+    probabilities, and centres (n,)."""
 
     numbers: Indices
     places: Indices
+    which: Indices
     scales: Floats
     squares: Floats
     log_weights: Floats
@@ -125,6 +135,7 @@ class RunTerms:
         self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
         self.terms = [*self._of_bearers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
+        self._decompositions = dict[tuple[InNoises, int, int], tuple[Floats, Floats, Floats]]()
 
     def _add_effects(self, columns: _Columns, test: CandidateTests, fitted: Sequence[tuple[Effect, float]]) -> None:
         """Add the candidates, each with every relation that its coefficients may have, and those that were fitted: of a
@@ -302,9 +313,10 @@ class RunTerms:
             numbers = np.flatnonzero(widths == width)
             terms = [self.terms[k] for k in numbers.tolist()]
             sizes, unit = [term.sizes for term in terms], np.ones(width)
+            places, which = np.unique([term.columns for term in terms], axis=0, return_inverse=True)
             alike.append(
                 _Alike(
-                    numbers, np.array([term.columns for term in terms]),
+                    numbers, places, which,
                     np.array([unit if term.scales is None else term.scales for term in terms]),
                     np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
                     np.array([each.centre for each in sizes]),
@@ -322,20 +334,50 @@ class RunTerms:
 
         explained (K, f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
         """
-        logs, every = np.zeros((len(self.terms), len(sizes))), slice(None)
-        for alike, grams, lengths in zip(self._alike, noises.grams, noises.lengths, strict=True):
-            few = every if some is None else some[alike.numbers]
-            places, scales = alike.places[few], alike.scales[few]
-            gram, along = grams[sizes][:, few], noises.along[sizes][:, places]
-            if explained is not None:
-                parts = np.moveaxis(explained[..., places], 1, 3)  # (K, n, q, f)
-                gram -= parts @ np.swapaxes(parts, 2, 3)
-                along -= (parts @ explained[:, None, :, -1:])[..., 0]
-            gram, along = gram * scales[:, :, None] * scales[:, None], along * scales
-            length = lengths[sizes][:, few] * scales.max(axis=1) ** 2
-            of_sizes = alike.squares[few], alike.log_weights[few], alike.centres[few]
-            logs[alike.numbers[few]] = log_bayes(gram, along, *of_sizes, length).T
+        logs = np.zeros((len(self.terms), len(sizes)))
+        for number, alike in enumerate(self._alike):
+            few = np.arange(len(alike.numbers)) if some is None else np.flatnonzero(some[alike.numbers])
+            logs[alike.numbers[few]] = self._log_bayes_of(noises, number, sizes, explained, few).T
         return logs
+
+    def _log_bayes_of(self, noises: InNoises, number: int, sizes: Sequence[int], explained: Floats | None,
+                      few: Indices) -> Floats:  # fmt: skip
+        """Return the log Bayes factors (K, n) of some of the terms that are alike."""
+        alike = self._alike[number]
+        squares, log_weights, centres = alike.squares[few], alike.log_weights[few], alike.centres[few]
+        if explained is None:
+            gram, along, lengths = self._products(noises, number, sizes, few)
+            return log_bayes(gram, along, squares, log_weights, centres, lengths)
+        parts = explained[..., alike.places[alike.which[few]]] * alike.scales[few]
+        parts = np.moveaxis(parts, 1, 3)  # (K, n, q, f)
+        if parts.shape[2] >= _WIDE and not centres.any():
+            decomposed = zip(*(self._decomposed(noises, number, k) for k in sizes), strict=True)
+            squared, turns, along = (np.concatenate(each)[:, few] for each in decomposed)
+            return log_bayes_beside(squared, turns, along, parts, explained[..., -1], squares, log_weights)
+        gram, along, lengths = self._products(noises, number, sizes, few)
+        gram -= parts @ np.swapaxes(parts, 2, 3)
+        along -= (parts @ explained[:, None, :, -1:])[..., 0]
+        return log_bayes(gram, along, squares, log_weights, centres, lengths)
+
+    def _products(self, noises: InNoises, number: int, sizes: Sequence[int], few: Indices
+                  ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+        """Return G^T W G (K, n, q, q) and G^T W z (K, n, q) of some of the terms that are alike, and the largest
+        squares (K, n) of their columns."""
+        alike = self._alike[number]
+        which, scales = alike.which[few], alike.scales[few]
+        of_sizes = np.array(sizes)
+        gram = noises.gram(number, of_sizes, which) * scales[:, :, None] * scales[:, None]
+        along = noises.along[sizes][:, alike.places[which]] * scales
+        return gram, along, noises.lengths[number][of_sizes[:, None], which] * scales.max(axis=1) ** 2
+
+    def _decomposed(self, noises: InNoises, number: int, size: int) -> tuple[Floats, Floats, Floats]:
+        """Return the terms that are alike turned to orthogonal columns in noise of one size, made once for all that
+        they are tried beside."""
+        key = noises, number, size
+        if key not in self._decompositions:
+            every = np.arange(len(self._alike[number].numbers))
+            self._decompositions[key] = orthonormal_columns(*self._products(noises, number, [size], every))
+        return self._decompositions[key]
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:
         """Orthonormal bases (n, q, r) of some terms in one noise, filled up with zeros, and the readings (r,)."""

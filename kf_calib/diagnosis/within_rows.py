@@ -112,12 +112,15 @@ class WithinRows:
             self._courses.append(np.zeros((4, len(dwells))))
             return
         parts = [of_model, of_effects, self._shared[pieces]]
-        nodes = min(part.shape[1] for part in parts)
-        both = np.concatenate([np.broadcast_to(p[:, :nodes], (len(p), nodes, *p.shape[2:])) for p in parts], axis=3)
-        self._largest = np.maximum(self._largest, np.abs(both).max(axis=(0, 1, 2)))
-        moving = _changing(both, dwells.folded.ends, self._largest)
-        moving[: self._model.count] = True
-        columns = OfPieces(both[..., moving], dwells.folded.ends)
+        nodes, moved = min(part.shape[1] for part in parts), list[Mask]()
+        parts = [np.broadcast_to(p[:, :nodes], (len(p), nodes, *p.shape[2:])) for p in parts]
+        for values in parts:  # one after another, because together they are many
+            largest = self._largest[sum(map(len, moved)) :][: values.shape[3]]
+            largest[:] = np.maximum(largest, np.maximum(values.max(axis=(0, 1, 2)), -values.min(axis=(0, 1, 2))))
+            moved.append(_changing(values, dwells.folded.ends, largest))
+        moved[0][:] = True
+        both = [values[..., moves] for values, moves in zip(parts, moved, strict=True)]
+        columns, moving = OfPieces(np.concatenate(both, axis=3), dwells.folded.ends), np.concatenate(moved)
         self.log += log_of_errors(dwells, self._noise, self._state)
         of_dwells = whiten(dwells, columns, self._noise, self._state, self._about[moving], reduced=False)
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)

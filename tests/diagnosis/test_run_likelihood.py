@@ -12,7 +12,15 @@ from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.run_likelihood import RunLikelihood, Sizes, integrated, log_bayes, log_bayes_together
+from kf_calib.diagnosis.run_likelihood import (
+    RunLikelihood,
+    Sizes,
+    integrated,
+    log_bayes,
+    log_bayes_beside,
+    log_bayes_together,
+    orthonormal_columns,
+)
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.noise.reml import with_shared_noise
 from kf_calib.noise.terms import WavesOverRun
@@ -149,7 +157,7 @@ def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterio
     noises = likelihood.in_noises(posterior._sizes.families[2].shapes, posterior._sizes.squares, [PLACES])
     for k in (0, 5, len(posterior._sizes.squares) - 1):
         rows = likelihood.projected(posterior._sizes.squares[k] * posterior._sizes.families[2].shapes, PLACES.ravel())
-        for gram, place in zip(noises.grams[0][k], PLACES, strict=True):
+        for gram, place in zip(noises.gram(0, np.array([k]), np.arange(len(PLACES)))[0], PLACES, strict=True):
             columns = rows.of(place)
             np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-6, atol=1e-9 * np.abs(gram).max())
             np.testing.assert_allclose(noises.along[k, place], columns.T @ rows.readings, rtol=1e-6, atol=1e-6)
@@ -194,3 +202,18 @@ def test_probabilities_are_those_of_the_evidence_and_families_add_up(posterior: 
     np.testing.assert_allclose([row.probability for row in table.rows], shares, rtol=1e-9, atol=1e-15)
     assert sum(shares) == pytest.approx(1.0) and (np.diff(shares) <= 0.0).all()
     assert set(table.families) == {family for row in table.rows for family in row.families}
+
+
+@pytest.mark.parametrize("common", [0, 2])
+def test_evidence_beside_others_is_that_of_what_they_leave(common: int) -> None:
+    """Also where the term has some of their columns, and nothing is left of these."""
+    rng = np.random.default_rng(1)
+    columns, beside, z = rng.normal(size=(60, 20)), rng.normal(size=(60, 3)), 3.0 * rng.normal(size=60)
+    columns[:, :common] = beside[:, :common]
+    basis = np.linalg.qr(beside)[0]
+    left = columns - basis @ (basis.T @ columns)
+    squares, logs, lengths = np.geomspace(1e-4, 1e4, 9)[None], np.full((1, 9), -np.log(9.0)), np.full((1, 1), 90.0)
+    terms = orthonormal_columns((columns.T @ columns)[None, None], (columns.T @ z)[None, None], lengths)
+    found = log_bayes_beside(*terms, (columns.T @ basis)[None, None], (basis.T @ z)[None], squares, logs)
+    gram, along = (left.T @ left)[None, None], (left.T @ z)[None, None]
+    assert found == pytest.approx(log_bayes(gram, along, squares, logs, np.zeros(1), lengths), abs=1e-9)
