@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
 
 _AXES = ("ax_mps2", "ay_mps2", "az_mps2")
-_TIME = re.compile(r"time|stamp|date|clock|^t([^a-z]|$)|^sec|^(m|u|n)s$|millis|micros|nanos", re.IGNORECASE)
 _SIZES = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
 
 
@@ -81,6 +79,7 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
     from kf_calib.sources.file_kind import FileKind
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.text.lines import Lines
+    from kf_calib.sources.text.names import meanings_of
     from kf_calib.sources.text.units import Units
 
     keys: BenchKeys = {"accel_scale": size, "accel_unit": "m/s2", "restate_input": True}
@@ -96,7 +95,8 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
         lacking = f"there is no column {absent[0]!r}" if len(names) == len(_AXES) else "it takes three names"
         raise InputError(f"--gyro {gyro!r}: {lacking}; the columns are {', '.join(header)}.")
     stated = {theirs: ours for theirs, ours in renamed(reading.columns).items() if ours.startswith("time")}
-    others = {name: "-" for name in header if name not in names and name not in stated and not _TIME.search(name)}
+    told = dict(zip(header, meanings_of(header, stated), strict=True))
+    others = {name: "-" for name, meaning in told.items() if name not in names and meaning.ours not in ("time", "")}
     columns = others | dict(zip(names, _AXES, strict=True)) | stated
     return Lines(path, keys, columns, units=replace(Units.of(keys), dataset=dataset), angles=False)
 

@@ -59,6 +59,17 @@ def test_gyroscopes_and_thermometer_are_taken_along(run: Any, rest: Path, unit: 
 
 
 @pytest.mark.parametrize(
+    "header", ["t,ax_mps2,ay_mps2,az_mps2,wx,wy,wz,T", "Timestamp [s],ax_mps2,ay_mps2,az_mps2,wx,wy,wz,T [C]"]
+)
+def test_beside_gyroscopes_a_temperature_is_no_time(run: Any, rest: Path, header: str) -> None:
+    """The names of a log mean the same to the gyroscopes as to the accelerometers."""
+    rest.write_text(rest.read_text().replace(COLUMNS, header, 1))
+    found = run.json("noise", rest, "--gyro", "wx,wy,wz")
+    rates = [channel for channel in found["channels"] if channel["channel"].startswith("gyroscope")]
+    assert [each["white_radps_per_sqrt_hz"] for each in rates] == pytest.approx([1e-3] * 3, rel=0.05)
+
+
+@pytest.mark.parametrize(
     ("gyro", "said"),
     [("wx,wy", "three names"), ("a", "three names"), ("wx,wy,w", "no column 'w'"), ("wx,wy,wz,wx", "three")],
 )
