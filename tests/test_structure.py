@@ -186,26 +186,26 @@ def test_nothing_lies_beside_the_packages() -> None:
 
 CEILINGS = {
     "kf_calib": 188,
-    "support": 1071,
+    "support": 1077,
     "bench": 1708,
-    "effects": 3129,
-    "sources": 11873,
-    "dwells": 3810,
-    "noise": 3405,
-    "estimation": 7894,
-    "design": 1875,
-    "diagnosis": 5814,
-    "online": 1617,
+    "effects": 3134,
+    "sources": 11889,
+    "dwells": 3814,
+    "noise": 3406,
+    "estimation": 7898,
+    "design": 1879,
+    "diagnosis": 5977,
+    "online": 1633,
     "exchange": 1962,
-    "views": 6927,
-    "cli": 3528,
-    "report": 780,
+    "views": 6930,
+    "cli": 3530,
+    "report": 783,
     "bags": 403,
     "certificate": 1500,
     "exports": 1146,
     "fleet": 4245,
     "logs": 365,
-    "positioning": 1957,
+    "positioning": 1959,
     "reproduction": 855,
 }
 """How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis and
@@ -217,7 +217,8 @@ own size; and with effects for what lags behind anything and the way that gimbal
 logs in layouts that their loggers chose, and for objects of many lines. Those of noise, estimation, exchange and views
 were raised for biases that walk by another amount each, and intervals that allow for it. Those of bench, support and
 dwells were raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels, and for
-the names of the state."""
+the names of the state. Several rose by some lines for names of the field, which are longer; that of diagnosis for noise
+of one gimbal, and for pairs that share decompositions and keep less in memory."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 
