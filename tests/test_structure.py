@@ -13,6 +13,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 PACKAGE = ROOT / "kf_calib"
@@ -146,7 +147,7 @@ def without_leaf(leaf: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("leaf", LEAVES)
+@pytest.mark.parametrize("leaf", ["fleet", *slow(*(leaf for leaf in LEAVES if leaf != "fleet"))])
 def test_the_program_works_without_a_leaf(leaf: str, tmp_path: Path) -> None:
     """Its folder deleted, with its line in the table of commands: all else is imported, helped with and evaluates."""
     folder = without_leaf(leaf, tmp_path)

@@ -216,6 +216,7 @@ def test_the_honest_error_of_a_run_without_effects_is_that_of_its_model(quiet: C
     assert quiet.held_out_rms_mps2 == pytest.approx(empty.rms_mps2, rel=0.15)
 
 
+@pytest.mark.slow
 def test_honest_errors_are_those_of_orientations_left_out() -> None:
     """As many folds as orientations and nothing to choose: leave-one-out of the fixed model, history and all."""
     before = run("hysteresis=15sigma", plan=spread_plan(12, dwell_s=8.0, seed=5))

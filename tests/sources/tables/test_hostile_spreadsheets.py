@@ -6,6 +6,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from datetime import datetime, time, timedelta
 from functools import cache
 from pathlib import Path
@@ -156,6 +157,7 @@ def test_a_log_with_a_long_name_takes_no_time(name: str, tmp_path: Path) -> None
         assert meaning_of(name).ours == ""
 
 
+@pytest.mark.slow
 def test_a_table_of_a_wide_header_and_many_rows_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text(",".join(f"c{k}" for k in range(200_000)) + "\n" + "1\n" * 1_000_000)
@@ -243,8 +245,9 @@ def test_cells_are_what_openpyxl_makes_of_them(tmp_path: Path) -> None:
         with zipfile.ZipFile(path, "w") as archive:
             for name, content in parts.items():
                 archive.writestr(name, changed_sheet if name == SHEET else content)
-        with warnings.catch_warnings(action="ignore"):  # of the date that is none
-            rows = list(openpyxl.load_workbook(path, read_only=True, data_only=True).active.iter_rows(values_only=True))
+        told = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        with closing(told), warnings.catch_warnings(action="ignore"):  # of the date that is none
+            rows = list(told.active.iter_rows(values_only=True))
         lines = [[None] * len(rows[0]) for _ in rows]
         for number, row in sheets_of(path)[0].lines:
             lines[number - 1][: len(row)] = row
