@@ -25,7 +25,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.lines import are_telling, reader_for
-from kf_calib.sources.text.reader import Account, LineReader, first_line, named
+from kf_calib.sources.text.reader import LineCounts, LineReader, first_line, named
 from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000
@@ -153,8 +153,8 @@ class CorrectedLines:
         self._correction, self._columns, self._overrides, self._name = correction, columns, overrides, name
         self._units = units or Units.of(overrides, input=correction.input)
         self._needs_temperature = bool(correction.needs_temperature)
-        self._account, self._temperature_c = Account(), np.nan
-        self._cutter = Cutter(self._account.refuse, keeps_ends=True)
+        self._counts, self._temperature_c = LineCounts(), np.nan
+        self._cutter = Cutter(self._counts.refuse, keeps_ends=True)
         self._waiting = list[str]()  # while it is not known what the lines are
         self._reader: LineReader | None = None
         self._input: RawInput | None = None
@@ -169,9 +169,9 @@ class CorrectedLines:
         """The line without an end, if there is one. Raises InputError where no readings have come at all."""
         last = self._corrected(self._cutter.rest(), is_end=True)
         if not self.readings:
-            self._account.unknown.clear()  # they pass
+            self._counts.unknown.clear()  # they pass
             advice = self._reader.advice if self._reader else "check that the logger wrote any"
-            raise self._account.refusal(f"{self._name}: no readings to correct", advice)
+            raise self._counts.refusal(f"{self._name}: no readings to correct", advice)
         if self._norm is not None:
             self._checked(final=True)
         return last
@@ -179,8 +179,8 @@ class CorrectedLines:
     @property
     def warnings(self) -> list[str]:
         """What was left out; unknown names are none of it: they pass."""
-        self._account.unknown.clear()
-        return self._account.sentences()
+        self._counts.unknown.clear()
+        return self._counts.sentences()
 
     @property
     def input(self) -> RawInput:
@@ -189,18 +189,18 @@ class CorrectedLines:
 
     def _corrected(self, lines: list[str], *, is_end: bool = False) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
-        self._account.lines += len(lines)
+        self._counts.lines += len(lines)
         self._waiting += lines
         heading = self._begun(is_end) if self._reader is None else []
         if self._reader is None:
             return b""
         lines, self._waiting = self._waiting, []
-        first, passed, samples = self._account.lines - len(lines) + 1, dict[int, str](), list[_Sample]()
+        first, passed, samples = self._counts.lines - len(lines) + 1, dict[int, str](), list[_Sample]()
         for number, row in self._reader.rows([line.rstrip("\r\n").lstrip("\ufeff") for line in lines], first):
             time_ns, readings, _, degrees = row or (0, None, None, None)
             self._temperature_c = degrees[0] if degrees else self._temperature_c
             if readings and self._needs_temperature and np.isnan(self._temperature_c):
-                self._account.refuse(number, "it came before the first temperature, which the calibration needs")
+                self._counts.refuse(number, "it came before the first temperature, which the calibration needs")
                 continue
             passed[number] = lines[number - first]
             if readings:
@@ -217,7 +217,7 @@ class CorrectedLines:
         if not told or not (is_end or are_telling(told)):
             return []
         with named(self._name):
-            self._reader, count = reader_for(told, self._columns, self._account, angles=False, units=self._units)
+            self._reader, count = reader_for(told, self._columns, self._counts, angles=False, units=self._units)
         heading, self._waiting = self._waiting[: blank + count], self._waiting[blank + count :]
         forces = [*texts[:blank], *self._reader.heading_of_forces(told[:count])]
         return [force + line[len(text) :] for force, text, line in zip(forces, texts, heading, strict=False)]
@@ -240,7 +240,7 @@ class CorrectedLines:
                 passed[number] = self._reader.with_readings(text, force.tolist()) + passed[number][len(text) :]
                 self.readings += 1
             else:
-                self._account.refuse(number, "no specific force gives these readings")
+                self._counts.refuse(number, "no specific force gives these readings")
                 del passed[number]
 
     def _checked(self, final: bool) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.text.reader import Account
+from kf_calib.sources.text.reader import LineCounts
 from kf_calib.support.text import counted
 
 IDLE_S = 0.02
@@ -51,7 +51,7 @@ def nothing(pose_width: int) -> Batch:
 class Feed(ABC):
     """Iterated once, by one thread; ``stop`` may be called from any other, and from a signal handler.
 
-    account: what could not be used. link: connecting, live, lost or ended. patient: nothing is lost where samples are
+    counts: what could not be used. link: connecting, live, lost or ended. patient: nothing is lost where samples are
     asked for later, as of a file. lost: readings known to be lost on the way, where the bench numbers them.
     """
 
@@ -59,7 +59,7 @@ class Feed(ABC):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.account = Account()
+        self.counts = LineCounts()
         self.link = "connecting"
         self.trouble = ""
         self.reconnects = 0
@@ -71,7 +71,7 @@ class Feed(ABC):
     @property
     def warnings(self) -> list[str]:
         """What was lost, and what was not understood, a sentence each."""
-        return [f"{self.name}: {said}" for said in self.account.sentences()]
+        return [f"{self.name}: {said}" for said in self.counts.sentences()]
 
     @abstractmethod
     def begin(self) -> Bench:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.text.reader import Account, Described
+from kf_calib.sources.text.reader import Described, LineCounts
 
 FRAME_VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"
@@ -75,7 +75,7 @@ def _uncobs_alike(table: Bytes) -> tuple[Bytes, Mask]:
 
 
 class FrameReader(Described):
-    """Reads frames block by block; those that cannot be used are put down in the account.
+    """Reads frames block by block; those that cannot be used are counted.
 
     lost: readings whose numbers are missing. The unit of readings is m/s^2, where no option states another.
     """
@@ -84,10 +84,10 @@ class FrameReader(Described):
         "send a frame of the bench, then frames of readings (kind A) and of poses (kind G or Q), as docs/live.md says"
     )
 
-    def __init__(self, account: Account) -> None:
-        super().__init__(account)
+    def __init__(self, counts: LineCounts) -> None:
+        super().__init__(counts)
         self.lost = 0
-        account.what = "frames"
+        counts.what = "frames"
         self._tail = b""
         self._number: int | None = None
 
@@ -97,15 +97,15 @@ class FrameReader(Described):
         if len(self._tail) > _LONGEST:  # no frame: what follows up to the next zero byte is none either
             self._tail = self._tail[: _LONGEST + 1]
         frames = [frame for frame in frames if frame]
-        first = self._account.lines + 1
-        self._account.lines += len(frames)
+        first = self._counts.lines + 1
+        self._counts.lines += len(frames)
         return self._read(frames, first)
 
     def cut_off(self) -> None:
         """The link broke: a frame that has begun will not end."""
         if self._tail:
-            self._account.lines += 1
-            self._account.refuse(self._account.lines, "the link broke in it")
+            self._counts.lines += 1
+            self._counts.refuse(self._counts.lines, "the link broke in it")
         self._tail = b""
 
     def joined_amid(self) -> None:
@@ -191,9 +191,9 @@ class FrameReader(Described):
     def _read_long(self, frame: bytes, place: int) -> None:
         body = _sound_body(frame) if len(frame) <= _LONGEST else None
         if body is None:
-            self._account.refuse(place, "its checksum does not fit")
+            self._counts.refuse(place, "its checksum does not fit")
         elif body[0] != BENCH:
-            self._account.refuse(place, f"it has {len(body) - _HEAD_BYTES - 4} bytes of values")
+            self._counts.refuse(place, f"it has {len(body) - _HEAD_BYTES - 4} bytes of values")
         else:
             self._learn(body[_HEAD_BYTES:-4], place)
 
@@ -204,7 +204,7 @@ class FrameReader(Described):
                 raise ValueError
             self.metadata = metadata_of({key: value for key, value in facts.items() if value is not None})
         except (ValueError, RecursionError):
-            self._account.refuse(place, "it holds no JSON object")
+            self._counts.refuse(place, "it holds no JSON object")
 
     def _follow(self, numbers: NDArray[np.int64]) -> None:
         """Counts the numbers passed over; one that is far off is that of a bench that counts anew."""
@@ -216,7 +216,7 @@ class FrameReader(Described):
 
     def _refuse(self, places: FramePlaces, reason: str) -> None:
         for place in places.tolist():
-            self._account.refuse(place, reason)
+            self._counts.refuse(place, reason)
 
 
 def _sound_body(frame: bytes) -> bytes | None:

@@ -14,7 +14,7 @@ from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import JsonLines
 from kf_calib.sources.text.lines import reader_for
-from kf_calib.sources.text.reader import Account, LineReader
+from kf_calib.sources.text.reader import LineCounts, LineReader
 from kf_calib.sources.text.units import Units
 
 _FEWEST_CELLS = 5  # time, readings and an angle
@@ -34,16 +34,16 @@ class LineProtocol:
     lost = None
 
     def __init__(
-        self, name: str, columns: Mapping[str, str], header: str, account: Account, angles: bool, units: Units
+        self, name: str, columns: Mapping[str, str], header: str, counts: LineCounts, angles: bool, units: Units
     ) -> None:  # fmt: skip
-        self._name, self._columns, self._account, self._angles = name, columns, account, angles
+        self._name, self._columns, self._counts, self._angles = name, columns, counts, angles
         self._units = units
-        self._cutter = Cutter(account.refuse)
+        self._cutter = Cutter(counts.refuse)
         self._heading = [header.strip()] if header.strip() else []
         self._waiting = list[str]()
         self.reader: LineReader | None = None
         if self._heading:
-            self.reader = self._reader(self._heading, account, angles)
+            self.reader = self._reader(self._heading, counts, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -61,8 +61,8 @@ class LineProtocol:
         elif isinstance(self.reader, JsonLines):
             is_known = bool(self.reader.pose_width or self.reader.metadata)
             lines = ["" if line.startswith('{"bench"') and is_known else line for line in lines]
-        batch = self.reader.read(lines, self._account.lines + 1)
-        self._account.lines += len(lines)
+        batch = self.reader.read(lines, self._counts.lines + 1)
+        self._counts.lines += len(lines)
         return batch
 
     def joined_amid(self) -> None:
@@ -72,8 +72,8 @@ class LineProtocol:
     def cut_off(self) -> None:
         """The link broke: a line that has begun will not end."""
         if self._cutter.is_amid:
-            self._account.lines += len(self._cutter.rest())
-            self._account.refuse(self._account.lines, "the link broke in it")
+            self._counts.lines += len(self._cutter.rest())
+            self._counts.refuse(self._counts.lines, "the link broke in it")
 
     def rest(self) -> Batch:
         """The sample on a last line without an end."""
@@ -83,7 +83,7 @@ class LineProtocol:
 
     def _without_half_a_row(self, lines: list[str]) -> list[str]:
         if isinstance(self.reader, CsvLines) and lines[0] and lines[0] not in self._heading:
-            self._account.refuse(self._account.lines + 1, "it may not be whole: the link was joined in it")
+            self._counts.refuse(self._counts.lines + 1, "it may not be whole: the link was joined in it")
             return ["", *lines[1:]]
         return lines
 
@@ -96,18 +96,18 @@ class LineProtocol:
                 return lines[i + len(self._heading) :]
             if self._waiting:
                 break
-            self._account.lines += 1
+            self._counts.lines += 1
             if text:
-                self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
+                self._counts.refuse(self._counts.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
-    def _reader(self, first: list[str], account: Account, angles: bool) -> LineReader:
-        return reader_for(first, self._columns, account, angles=angles, units=self._units)[0]
+    def _reader(self, first: list[str], counts: LineCounts, angles: bool) -> LineReader:
+        return reader_for(first, self._columns, counts, angles=angles, units=self._units)[0]
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
         try:
-            self._reader(heading, Account(), angles=False)
+            self._reader(heading, LineCounts(), angles=False)
         except InputError:
             return False
         return True
@@ -119,7 +119,7 @@ class LineProtocol:
                 json.loads(text)
             except (ValueError, RecursionError):
                 return False
-            self.reader = self._reader([text], self._account, self._angles)
+            self.reader = self._reader([text], self._counts, self._angles)
             return True
         cells = text.split(max(",;\t", key=text.count))
         if (
@@ -133,11 +133,11 @@ class LineProtocol:
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
                 continue
             try:
-                self.reader, self._heading = self._reader(heading, self._account, self._angles), heading
+                self.reader, self._heading = self._reader(heading, self._counts, self._angles), heading
             except InputError as error:
                 lacks = error
                 continue
-            self._account.lines += len(heading)
+            self._counts.lines += len(heading)
             self._is_first = False
             return True
         if following is None:
@@ -153,10 +153,10 @@ class Protocol:
     def __init__(
         self, name: str, columns: Mapping[str, str], header: str, angles: bool = True, units: Units | None = None
     ) -> None:
-        self.account = Account()
+        self.counts = LineCounts()
         self._name = name
         self.form: LineProtocol | FrameReader = LineProtocol(
-            name, columns, header, self.account, angles, units or Units()
+            name, columns, header, self.counts, angles, units or Units()
         )
         self._held, self._seen = b"", 0
 
@@ -172,20 +172,20 @@ class Protocol:
             if b"\0" in self._held and (batch := self._frames_in(self._held)) is not None:
                 return batch
         batch = self.form.push(block)
-        if self.reader is None and (self.account.lines > _MOST_LINES or self._seen > _MOST_BYTES):
+        if self.reader is None and (self.counts.lines > _MOST_LINES or self._seen > _MOST_BYTES):
             raise self.unusable("no header of CSV, no JSON object and no binary frame")
         return batch
 
     def _frames_in(self, held: bytes) -> Batch | None:
-        account = Account()
-        frames = FrameReader(account)
+        counts = LineCounts()
+        frames = FrameReader(counts)
         batch = frames.push(held)
-        if account.malformed == account.lines:
+        if counts.malformed == counts.lines:
             return None
-        self.account, self.form = account, frames
+        self.counts, self.form = counts, frames
         return batch
 
     def unusable(self, what: str) -> InputError:
         """That the bytes cannot be used, with what was seen of them."""
         advice = self.reader.advice if self.reader else "have it send its header again, or state it (--header)"
-        return self.account.refusal(f"{self._name}: {what}", advice)
+        return self.counts.refusal(f"{self._name}: {what}", advice)

@@ -137,7 +137,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
     @property
     def status(self) -> Status:
         """How things stand now."""
-        feed, first = self._feed, self._feed.account.first_malformed
+        feed, first = self._feed, self._feed.counts.first_malformed
         with self._lock:
             now, recorder = time.monotonic(), self._recorder
             return Status(
@@ -147,7 +147,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
                 samples=self._counts.readings,
                 poses=self._counts.poses,
                 temperatures=self._counts.temperatures,
-                refused=feed.account.malformed,
+                refused=feed.counts.malformed,
                 first_refusal=f"{first[0]}: {first[1]}" if first else "",
                 gaps=self._continuity.gaps,
                 missing=self._continuity.missing if feed.lost is None else feed.lost,
@@ -329,9 +329,9 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         fits = (stream.time_ns >= 0) & (stream.time_ns < _LATEST_NS)
         if fits.all():
             return stream
-        account = self._feed.account
+        counts = self._feed.counts
         for _ in range(int((~fits).sum())):
-            account.refuse(account.lines, "its time stamp is not between 1970 and 2038")
+            counts.refuse(counts.lines, "its time stamp is not between 1970 and 2038")
         return stream[fits]
 
     def _count(self, batch: Batch) -> None:

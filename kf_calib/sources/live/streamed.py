@@ -189,7 +189,7 @@ class StreamedFeed(Feed):
                     yield item
                 case _Ended():
                     yield self._protocol.form.rest()
-            self.account, self.lost = self._protocol.account, self._protocol.form.lost
+            self.counts, self.lost = self._protocol.counts, self._protocol.form.lost
             if isinstance(item, _Ended):
                 return
 

@@ -14,7 +14,7 @@ from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, written
 from kf_calib.sources.text.columns import WANTED, Columns
 from kf_calib.sources.text.heading import with_texts, without_empty_end
 from kf_calib.sources.text.names import READINGS
-from kf_calib.sources.text.reader import Account, LineReader, SampleRow
+from kf_calib.sources.text.reader import LineCounts, LineReader, SampleRow
 from kf_calib.sources.text.units import celsius
 from kf_calib.support.text import cut
 
@@ -33,8 +33,8 @@ class CsvLines(LineReader):
 
     advice = WANTED
 
-    def __init__(self, columns: Columns, account: Account, angles: bool | None = True) -> None:
-        super().__init__(account)
+    def __init__(self, columns: Columns, counts: LineCounts, angles: bool | None = True) -> None:
+        super().__init__(counts)
         self._columns, self._heading, self._header = columns, columns.heading, columns.header
         self._time, self._accel = columns.time(), columns.accel()
         self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
@@ -49,7 +49,7 @@ class CsvLines(LineReader):
         _refuse_several_units(columns, used)
         columns_named = enumerate(zip(columns.names, columns.meanings, strict=True))
         unknown = [name for at, (name, own) in columns_named if name and at not in used and not own.other]
-        self._account.leave_out(unknown)  # not those of a gyroscope, say, which are of no use here
+        self._counts.leave_out(unknown)  # not those of a gyroscope, say, which are of no use here
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         values = zip(self._accel.at, readings_mps2, self._columns.written_mps2, strict=True)

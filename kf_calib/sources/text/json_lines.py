@@ -13,7 +13,7 @@ from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS
 from kf_calib.sources.text.cells import LineError, stamp_ns, written
 from kf_calib.sources.text.heading import scalars, with_texts
-from kf_calib.sources.text.reader import Account, LineReader, SampleRow
+from kf_calib.sources.text.reader import LineCounts, LineReader, SampleRow
 
 _MARK = "\ufeff"  # some write it before the first line
 _TIME_NS = {"time_ns": 1, "time_us": 10**3, "time_ms": 10**6, "time_s": 10**9}
@@ -50,8 +50,8 @@ class JsonLines(LineReader):
 
     advice = "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
-    def __init__(self, columns: Mapping[str, str], account: Account, angles: bool = True) -> None:
-        super().__init__(account)
+    def __init__(self, columns: Mapping[str, str], counts: LineCounts, angles: bool = True) -> None:
+        super().__init__(counts)
         self._columns, self._is_first, self.wants_pose = columns, True, angles
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
@@ -84,7 +84,7 @@ class JsonLines(LineReader):
         if pose and not self.pose_width:  # all on the line is understood before any of it is used
             self.pose_width, self.has_angles = len(pose), _first_of(entry, POSE_KEYS) != _ATTITUDE
         if not entry.keys() <= _KNOWN:
-            self._account.leave_out(key for key in entry if key not in _KNOWN)
+            self._counts.leave_out(key for key in entry if key not in _KNOWN)
         return time_ns, readings, pose, degrees
 
     def _entry(self, line: str, decode: Callable[[str], dict[str, Any]]) -> dict[str, Any]:

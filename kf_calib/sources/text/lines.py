@@ -29,7 +29,7 @@ from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter, TextFile, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines, are_ours
-from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
+from kf_calib.sources.text.reader import LineCounts, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
 _BLOCK_BYTES = 1 << 18
@@ -68,7 +68,7 @@ class Lines:
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
         self._angles = True if angles is None and not self.path else angles
-        self._account, self.fraction = Account(), 0.0
+        self._counts, self.fraction = LineCounts(), 0.0
         self._file: TextFile | None = None
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
@@ -94,7 +94,7 @@ class Lines:
         """What was taken for what, where that is not plain, and what was not used."""
         chosen, trouble = (self._file.said, self._file.trouble) if self._file else ((), "")
         taken = "; ".join(self.described.said) if self.described else ""
-        told = [*(f"{said}." for said in chosen), f"{taken}. {HOW}." * bool(taken), trouble, *self._account.sentences()]
+        told = [*(f"{said}." for said in chosen), f"{taken}. {HOW}." * bool(taken), trouble, *self._counts.sentences()]
         return [*self._said, *(f"{self.name}: {sentence}" for sentence in told if sentence)]
 
     def __iter__(self) -> Iterator[Batch]:
@@ -138,21 +138,21 @@ class Lines:
             lacks_pose = self.described is None or (self.described.wants_pose and not self.described.pose_width)
             if has_accel and not lacks_pose:
                 break
-            if self._account.lines > _SURVEY_LINES:
+            if self._counts.lines > _SURVEY_LINES:
                 raise self._unusable("platform angles" if lacks_pose else "readings")
         return itertools.chain((ahead.popleft() for _ in range(len(ahead))), batches)
 
     def _read(self, stream: BinaryIO | TextFile) -> Iterator[Batch]:
         """Yield what all lines hold. The first of them choose the reader, of CSV with some rows, which tell what the
         header may not."""
-        account = self._account = Account()
+        counts = self._counts = LineCounts()
         has_accel, has_pose, first = False, False, list[str]()
         try:
             blocks = self._blocks(stream)
             for lines in blocks:
                 first += lines
                 blank = first_line(first)
-                account.lines += blank
+                counts.lines += blank
                 del first[:blank]
                 if first and are_telling(first):
                     break
@@ -161,10 +161,10 @@ class Lines:
             with named(self.name):
                 reader, heading = self._reader(first)
             self.described = reader
-            account.lines += heading
+            counts.lines += heading
             for lines in itertools.chain([first[heading:]], blocks):
-                batch = reader.read(lines, account.lines + 1)
-                account.lines += len(lines)
+                batch = reader.read(lines, counts.lines + 1)
+                counts.lines += len(lines)
                 has_accel, has_pose = has_accel or len(batch.accel) > 0, has_pose or len(batch.pose) > 0
                 yield batch
         finally:
@@ -176,7 +176,7 @@ class Lines:
 
     def _blocks(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
         """Yield whole lines, block by block as they arrive."""
-        cutter = Cutter(self._account.refuse)
+        cutter = Cutter(self._counts.refuse)
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
         try:
             while block := read(_BLOCK_BYTES):
@@ -192,14 +192,14 @@ class Lines:
     def _unusable(self, what: str) -> InputError:
         without = ", or do without (--no-angles)" if what == "platform angles" else ""
         advice = self.described.advice if self.described else ""
-        return self._account.refusal(f"{self.name}: no {what}", advice + without)
+        return self._counts.refusal(f"{self.name}: no {what}", advice + without)
 
     def _reader(self, lines: Sequence[str]) -> tuple[LineReader, int]:
         angles = self._angles
         if angles is None and self.path and is_json(lines[0]):
             theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
             angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-        return reader_for(lines, self._columns, self._account, angles=angles, units=self._units, stated=self._stated)
+        return reader_for(lines, self._columns, self._counts, angles=angles, units=self._units, stated=self._stated)
 
 
 def are_telling(lines: Sequence[str]) -> bool:
@@ -208,7 +208,7 @@ def are_telling(lines: Sequence[str]) -> bool:
 
 
 def reader_for(
-    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units,
+    lines: Sequence[str], columns: Mapping[str, str], counts: LineCounts, *, angles: bool | None, units: Units,
     stated: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[LineReader, int]:  # fmt: skip
     """The reader that the first lines ask for, and how many of these are its heading.
@@ -220,7 +220,7 @@ def reader_for(
         raise InputError("is one array of JSON: write an object a line, as jq -c '.[]' does.")
     told = TextHeading.of_json(lines) if is_json(lines[0]) and not are_ours(lines, columns) else None
     if is_json(lines[0]) and told is None:
-        return JsonLines(columns, account, angles is not False), 0
+        return JsonLines(columns, counts, angles is not False), 0
     heading = told or TextHeading.of(lines)
     refuse_unknown_names(stated, heading.header)
-    return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
+    return CsvLines(Columns(heading, columns, units), counts, angles), heading.lines

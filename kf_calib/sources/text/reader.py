@@ -1,4 +1,4 @@
-"""What the readers of JSON and CSV lines share: rows, and an account of what was not used."""
+"""What the readers of JSON and CSV lines share: rows, and counts of what was not used."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def named(name: str) -> Iterator[None]:
 
 
 @dataclass
-class Account:
+class LineCounts:
     """Lines read, lines that could not be used (with the first of them), and names that mean nothing to us."""
 
     lines: int = 0
@@ -92,9 +92,9 @@ class Described:
     raw: RawInput | None = None
     unit: str | None = None
 
-    def __init__(self, account: Account) -> None:
+    def __init__(self, counts: LineCounts) -> None:
         self.metadata, self.said = dict[str, str](), list[str]()
-        self._account = account
+        self._counts = counts
 
     def stated(self, name: str, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
         """The bench keys that what came, options and the names of the readings state; name: of the source, default: the
@@ -143,7 +143,7 @@ SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | Non
 
 
 class LineReader(Described, ABC):
-    """Reads lines block by block; those that cannot be used are put down in the account.
+    """Reads lines block by block; those that cannot be used are counted.
 
     Readings are in batches as they stand in the lines. advice: how quantities have to be named. wants_pose: whether
     orientations count.
@@ -171,7 +171,7 @@ class LineReader(Described, ABC):
             try:
                 yield number, self._row(line) if line and not line.isspace() else None
             except LineError as error:
-                self._account.refuse(number, str(error))
+                self._counts.refuse(number, str(error))
 
     @abstractmethod
     def _row(self, line: str) -> SampleRow | None:

@@ -113,15 +113,15 @@ TRIED = Counter[str]()
 def try_all(form: str, inputs: list[bytes], *, is_begun: bool) -> None:
     """The inputs one by one, then a sound one, of which all must come; and all at once, of which the same must come."""
     chain, end = _Chain(form, is_begun=is_begun), b"\0" if form == "frames" else b"\n"
-    account = chain.protocol.account
+    counts = chain.protocol.counts
     came = sum([chain.push(data + end) for data in [*inputs, b""]])
-    before = account.malformed
-    got, refused = chain.push(_sound(form, 1)), account.malformed - before
+    before = counts.malformed
+    got, refused = chain.push(_sound(form, 1)), counts.malformed - before
     assert (got, refused) == (1, 0) or (not is_begun and refused == 1)  # poses may have been settled otherwise
     at_once = _Chain(form, is_begun=is_begun)
     assert at_once.push(b"".join(data + end for data in [*inputs, b""]) + _sound(form, 1)) == came + got
-    assert at_once.protocol.account.malformed == account.malformed
-    assert account.malformed <= account.lines and all(map(str.isprintable, account.sentences()))
+    assert at_once.protocol.counts.malformed == counts.malformed
+    assert counts.malformed <= counts.lines and all(map(str.isprintable, counts.sentences()))
     TRIED[form] += len(inputs)
 
 
@@ -168,10 +168,10 @@ def test_inputs_that_ended_runs(form: str, data: bytes, is_begun: bool) -> None:
     try_all(form, [data], is_begun=is_begun)
     chain = _Chain(form, is_begun=is_begun)
     assert chain.push(data + (b"\0" if form == "frames" else b"\n")) == 0
-    assert chain.protocol.account.malformed == 1
+    assert chain.protocol.counts.malformed == 1
 
 
 def test_numbers_that_are_finite_one_by_one_need_no_finite_sum() -> None:
     chain = _Chain("csv", is_begun=False)
     assert chain.push(b"1.5,9e307,9e307,9e307,8.988465674311579e+307,8.98846567431158e+307,7,20\n") == 1
-    assert chain.protocol.account.malformed == 0
+    assert chain.protocol.counts.malformed == 0

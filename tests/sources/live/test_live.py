@@ -48,7 +48,7 @@ from kf_calib.sources.live.clock import Continuity
 from kf_calib.sources.live.feed import Lost, Regained
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.text.reader import Account
+from kf_calib.sources.text.reader import LineCounts
 
 
 def server(*conversations: bytes) -> tuple[str, threading.Thread]:
@@ -88,7 +88,7 @@ def test_however_the_bytes_are_cut_the_samples_are_the_same(talk, size: int) -> 
     whole, protocol = talk(0, 40), Protocol("script", {}, "")
     got = [protocol.push(whole[k : k + size]) for k in range(0, len(whole), size)]
     assert [number for batch in [*got, protocol.form.rest()] for number in numbers(batch)] == list(range(40))
-    assert protocol.account.sentences() == []
+    assert protocol.counts.sentences() == []
 
 
 def test_the_simulator_live_gives_what_a_replay_gives_bit_for_bit(tmp_path: Path) -> None:
@@ -503,25 +503,25 @@ def test_every_damaged_byte_is_found_and_numbers_tell_what_is_lost() -> None:
     damaged = good.copy()
     for k in range(45):
         damaged[k + 5] = good[k + 5][:k] + bytes([good[k + 5][k] ^ 0x55 or 1]) + good[k + 5][k + 1 :]
-    account = Account()
-    reader = frames.FrameReader(account)
+    counts = LineCounts()
+    reader = frames.FrameReader(counts)
     batch = reader.push(b"".join(damaged))
     assert batch.accel.values[:, 0].tolist() == [*range(5), *range(50, 60)]
-    assert reader.lost == 45 and account.malformed >= 45 and account.what == "frames"
+    assert reader.lost == 45 and counts.malformed >= 45 and counts.what == "frames"
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=80), st.just(b"\0"), st.just(frame_rows(0, 1))), max_size=8))
 def test_no_bytes_upset_the_frames(pieces: list[bytes]) -> None:
-    reader = frames.FrameReader(Account())
+    reader = frames.FrameReader(LineCounts())
     for piece in pieces:
         reader.push(piece)
     assert len(reader.push(b"\0" + frame_rows(5, 6)).accel) == 1
 
 
 def test_poses_of_another_kind_and_numbers_that_are_not_finite_are_refused() -> None:
-    account = Account()
-    reader = frames.FrameReader(account)
+    counts = LineCounts()
+    reader = frames.FrameReader(counts)
     batch = reader.push(
         sent_frames.sample(frames.ANGLES, 0, 1, (0.1, 0.2, 0.3))
         + sent_frames.sample(frames.ATTITUDE, 0, 2, (0.0, 0.0, 0.0, 1.0))
@@ -529,7 +529,7 @@ def test_poses_of_another_kind_and_numbers_that_are_not_finite_are_refused() -> 
         + sent_frames.sample(frames.ACCEL, 0, 4, (float("nan"), 0.0, 0.0))
         + sent_frames.sample(ord("?"), 0, 5, (1.0,))
     )
-    assert (len(batch.pose), len(batch.accel), account.malformed) == (1, 0, 4)
+    assert (len(batch.pose), len(batch.accel), counts.malformed) == (1, 0, 4)
 
 
 # -- continuity --
