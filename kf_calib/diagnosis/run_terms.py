@@ -316,7 +316,7 @@ class RunTerms:
             places, which = np.unique([term.columns for term in terms], axis=0, return_inverse=True)
             alike.append(
                 _Alike(
-                    numbers, places, which,
+                    numbers, places, which.ravel(),  # of numpy 2.0 it is (n, 1)
                     np.array([unit if term.scales is None else term.scales for term in terms]),
                     np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
                     np.array([each.centre for each in sizes]),
