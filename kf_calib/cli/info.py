@@ -346,6 +346,6 @@ def _fields(inventory: Inventory) -> list[str]:
     quaternions = [(topic.name, path, has_time(topic.paths)) for topic in unknown if (path := attitude_in(topic.paths))]
     if not quaternions:
         may_be_angles = accel or any(meaning_of(path).ours == "angle" for each in unknown for path in each.paths)
-        return [*accel, *(["--field angles=TOPIC:OUTER,MIDDLE,INNER_CONSTANTS@TIME"] if may_be_angles else [])]
+        return [*accel, *(["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"] if may_be_angles else [])]
     name, path, is_timed = max(quaternions, key=lambda each: each[2])
     return [*accel, f"--field attitude={name}:{path}{'' if is_timed else '@TIME'}"]

@@ -285,7 +285,7 @@ class RunStatus(Progress):
 
     @property
     def stayed_s(self) -> float:
-        """Duration of the readings of the open dwell by now, s: those of the latest snapshot, and what came since."""
+        """Duration of the readings of the open dwell by now, s: those of the latest look at it, and what came since."""
         return 0.0 if self.current is None else self.current.seconds + self.elapsed_s - self.looked_s
 
     @property

@@ -91,7 +91,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Rules:
-    """Limits that hold for every command and every read-back: of the bench, of its slew_times, and of a motion.
+    """Limits that hold for every command and every read-back: of the bench, of its slews, and of a motion.
 
     until_s: when the time of the run is spent, and a stay ends in any case.
     """
@@ -190,7 +190,7 @@ def _outside(gimbal_deg: Sequence[float], rules: Rules) -> str:
 
 
 def _moving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
-    """SequentialTest a move until the platform stands at its target."""
+    """Watch a move until the platform stands at its target."""
     watch, lasted_s, target = rules.watch, seen.now_s - state.since_s, _deg(state.target)
     expected_s = float(rules.slew_times.slews_s(np.radians(state.start), np.radians(state.target)))
     here, off = np.array(seen.gimbal_deg), np.abs(np.array(seen.gimbal_deg) - np.array(state.target)).max()

@@ -80,7 +80,10 @@ def test_what_messages_in_json_have(facts: Any, tmp_path: Path) -> None:
     found = facts(path)
     assert found["topics"][0]["fields"] == ["t", "acc.x", "l.v"]
     assert len(found["missing"]) == 3 and "has no accelerometer topic" in found["missing"][0]
-    assert "--field" in found["missing"][0] and "--field accel=TOPIC:X,Y,Z@TIME --field angles=" in found["command"]
+    assert (
+        "--field" in found["missing"][0]
+        and "--field accel=TOPIC:X,Y,Z@TIME --field angles=TOPIC:OUTER,MIDDLE,INNER@TIME" in found["command"]
+    )
     assert "TOPIC" not in facts(path, "--field", "accel=/imu:l.v@t", "--field", "attitude=/imu:acc@t")["command"]
 
 
