@@ -29,8 +29,9 @@ from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
+from kf_calib.support.json_values import json_value
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,11 @@ def sign(values: Floats, least: float = ROUNDING) -> Floats:
     return np.sign(np.where(np.abs(values) > least, values, 0.0))
 
 
+def portions(count: int, most: int) -> Iterator[slice]:
+    """Slices of at most ``most``, one after another, that hold ``count`` together."""
+    return (slice(k, min(k + most, count)) for k in range(0, count, most))
+
+
 def first_least(values: Floats, tie: float = ROUNDING) -> int:
     """Index of the least of numbers (n,); the first of those that are as small but for rounding.
 

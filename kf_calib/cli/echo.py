@@ -14,6 +14,7 @@ from typing import Any, TextIO
 import click
 
 from kf_calib.errors import KfCalibError
+from kf_calib.support.json_values import json_value
 from kf_calib.support.text import printable, sentence
 
 _SIGNS = "µσΔχ²±┃"
@@ -112,8 +113,6 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 def json_line(content: Mapping[str, Any]) -> str:
     """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
-    from kf_calib.views.json import json_value
-
     text = json.dumps(json_value(content), ensure_ascii=False, allow_nan=False)
     return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 

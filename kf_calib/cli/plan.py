@@ -104,7 +104,7 @@ def plan(
         return
     outputs = claimed(overwrite=overwrite)
     information = _information(options, reading, evaluation, as_json)
-    limits = _reach(information.model.bench, options)
+    limits = _limits(information.model.bench, options)
     scheme = Scheme.of(limits, options.repeats, options.antipodal)
     search = Search(information, limits, _aim(options, information.model.bench.gravity_mps2), scheme)
     timing = Timing(information.dwell_s, options.slew_degps, options.time_correlation)
@@ -219,7 +219,7 @@ def _with_gimbals(recording: Path, bench: Bench, reading: ReadingOptions) -> Ben
     return replace(bench, axes=parse_axes(stated))
 
 
-def _reach(bench: Bench, options: PlanOptions) -> GimbalLimits:
+def _limits(bench: Bench, options: PlanOptions) -> GimbalLimits:
     from kf_calib.bench.bench import axis_names
     from kf_calib.bench.keys import ranges
     from kf_calib.design.gimbal_limits import GimbalLimits

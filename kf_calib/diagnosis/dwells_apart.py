@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import IN_CACHE, Floats
+from kf_calib.bench.arrays import IN_CACHE, Floats, portions
 from kf_calib.diagnosis.hypothesis_table import PRIOR
 from kf_calib.diagnosis.in_noises import InNoises, Spanned
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
@@ -69,9 +69,9 @@ class DwellsApart:
         changes = self.courses.log_bayes(math.exp(self._log_prior))
         most = max(IN_CACHE // (8 * len(self.rows)), 1)  # sizes of noise at once
         means = [
-            self._of_means(*of_family.dwells(self.rows, without, slice(k, k + most)))
+            self._of_means(*of_family.dwells(self.rows, without, part))
             for of_family in self.noises
-            for k in range(0, len(of_family), most)
+            for part in portions(len(of_family), most)
         ]
         return np.concatenate(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)
 
@@ -80,10 +80,9 @@ class DwellsApart:
         offsets = log_bayes_of_any_size(gram, along)
         if not self.sizes.turns:
             return offsets
-        turns = np.stack([*self.sizes.turns.values()])[..., None]  # (gimbals, D, 3, 1)
         of_turns = [
             log_bayes_of_any_size(turn.swapaxes(1, 2) @ gram @ turn, (along[:, :, None] @ turn)[:, :, 0])
-            for turn in turns
+            for turn in (of_gimbal[..., None] for of_gimbal in self.sizes.turns.values())
         ]
-        of_one = np.logaddexp.reduce(of_turns) - math.log(len(turns))
+        of_one = np.logaddexp.reduce(of_turns) - math.log(len(of_turns))
         return np.logaddexp(offsets, of_one) - math.log(2.0)

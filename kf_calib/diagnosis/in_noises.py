@@ -12,12 +12,12 @@ subtracted in any other is little, and rounding does not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import IN_CACHE, Floats, Indices
+from kf_calib.bench.arrays import IN_CACHE, Floats, Indices, portions
 from kf_calib.estimation.candidate_scan import SEEN
 
 ROUNDING = 1e-10
@@ -110,7 +110,7 @@ class InNoises:
         """Project the sums (K, n, pairs) of the products of a group, and return the largest squares (K, n) before."""
         first, second = np.triu_indices(group.shape[1])
         most = max(8 * IN_CACHE // max(len(self._rows.more_columns) * group.shape[1], 1), 1)
-        for few in (slice(k, k + most) for k in range(0, len(group), most)):
+        for few in portions(len(group), most):
             more = np.swapaxes(self._rows.more_columns.T[group[few]], 1, 2)
             sums[:, few] += (np.swapaxes(more, 1, 2) @ more)[:, first, second]
         lengths = sums[..., first == second].max(axis=2)
@@ -172,11 +172,11 @@ class InNoises:
         parts = zip(groups, ends[:-1].tolist(), ends[1:].tolist(), strict=True)
         return [_explained(products[:, a:b], group, lengths[:, a:b]) for group, a, b in parts]
 
-    def _parts(self) -> list[slice]:
+    def _parts(self) -> Iterator[slice]:
         """Return few dwells at a time."""
         widest = max(self._rows.columns.shape[2], len(self._weights) * self._spanned) + 1
         most = max(8 * IN_CACHE // (3 * widest), 1)
-        return [slice(k, k + most) for k in range(0, len(self._rows), most)]
+        return portions(len(self._rows), most)
 
     def _of_rows(self, part: slice) -> Floats:
         """Return the weights (K, r) of the rows of some dwells."""
@@ -198,11 +198,11 @@ def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats
     """Add to sums (K, n, pairs) the products of columns (C, r) of a group in all weights (K, r)."""
     first, second = np.triu_indices(group.shape[1])
     most = max(8 * IN_CACHE // (len(first) * columns.shape[1]), 1)
-    for k in range(0, len(group), most):
-        few = columns[group[k : k + most]]
+    for part in portions(len(group), most):
+        few = columns[group[part]]
         products = few[:, first] * few[:, second]
         summed = products.reshape(-1, columns.shape[1]) @ weights.T
-        sums[:, k : k + most] += np.moveaxis(summed.reshape(*products.shape[:2], -1), 2, 0)
+        sums[:, part] += np.moveaxis(summed.reshape(*products.shape[:2], -1), 2, 0)
 
 
 def _explained(products: Floats, group: Indices, lengths: Floats) -> Floats:

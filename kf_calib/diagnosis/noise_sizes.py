@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -32,8 +31,8 @@ _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of 
 class NoiseFamily:
     """Noise of which some parts are free.
 
-    parts: "setting" and "common" (scatter). shapes: covariances (D, 3, 3) per unit of
-    the squared size, in units of the noise that was stated. log_prior: log of its prior probability.
+    parts: "setting" and "common" (scatter). shapes: covariances (D, 3, 3) per unit of the squared size, in units of the
+    noise that was stated. log_prior: log of its prior probability.
     """
 
     parts: Parts
@@ -48,9 +47,7 @@ class NoiseSizes:
     (D, 3) of the means by a turn of each gimbal, by its name.
     """
 
-    def __init__(
-        self, likelihood: RunLikelihood, noise: Noise, spare: int, turns: Mapping[str, Floats] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, likelihood: RunLikelihood, noise: Noise, spare: int, turns: Mapping[str, Floats]) -> None:
         self._likelihood, self._noise, self._spare, self.turns = likelihood, noise, spare, turns
         self._sizes = likelihood.sizes_of_noise()
 

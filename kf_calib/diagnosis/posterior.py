@@ -17,7 +17,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg import block_diag
 
-from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.bench.arrays import Floats, Indices, portions
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
 from kf_calib.diagnosis.dwells_apart import DwellsApart
@@ -171,9 +171,8 @@ class RunPosterior:
     @cached_property
     def _log_bayes(self) -> Floats:
         """Log Bayes factors (terms, noises) of all terms."""
-        few = [(noises, range(len(noises))[k : k + _AT_ONCE]) for noises in self._noises
-               for k in range(0, len(noises), _AT_ONCE)]  # fmt: skip
-        return np.hstack([self._run.log_bayes(noises, sizes) for noises, sizes in few])
+        few = [(noises, part) for noises in self._noises for part in portions(len(noises), _AT_ONCE)]
+        return np.hstack([self._run.log_bayes(noises, range(len(noises))[part]) for noises, part in few])
 
     @cached_property
     def _log_evidence(self) -> Floats:

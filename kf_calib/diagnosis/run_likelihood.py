@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import AT_ONCE, Floats, Indices
+from kf_calib.bench.arrays import AT_ONCE, Floats, Indices, portions
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
@@ -269,7 +269,7 @@ def _off(
     onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
     for k in range(len(columns)):
         columns[k] -= of_means[k] @ onto
-    for few in (slice(k, k + AT_ONCE // 8) for k in range(0, len(more), AT_ONCE // 8)):
+    for few in portions(len(more), AT_ONCE // 8):
         more_columns[few] -= more[few] @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
     # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import AT_ONCE, Floats, Mask
+from kf_calib.bench.arrays import AT_ONCE, Floats, Mask, portions
 
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
@@ -66,7 +66,7 @@ def multiplied(rows: Floats, matrix: Floats) -> Floats:
     """The product (m, l) of rows (m, n) and a matrix (n, l) that is no wider; to save memory, it overwrites the
     rows."""
     product = rows[:, : matrix.shape[1]]
-    for part in (slice(k, k + AT_ONCE) for k in range(0, len(rows), AT_ONCE)):
+    for part in portions(len(rows), AT_ONCE):
         product[part] = rows[part] @ matrix
     return product
 

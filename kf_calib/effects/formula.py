@@ -142,11 +142,8 @@ def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
 def _check(effect: Formula | FrameFormula, bench: Bench, large: float) -> None:
     """Give an effect its units, what its checks say, and the scale of its coefficients: with it, it adds ``large`` on a
     trial run. Raises InputError where it cannot be used."""
-    reading, stimulus, turning = (
-        effect.reading,
-        _trial(bench.axes, bench.gravity_mps2),
-        isinstance(effect, RotationEffect),
-    )
+    reading, turning = effect.reading, isinstance(effect, RotationEffect)
+    stimulus = _trial(bench.axes, bench.gravity_mps2)
     unit, shown = _units(reading, turning)
     if turning and reading(stimulus).shape[1] != 1:
         words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."

@@ -149,11 +149,7 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     warnings = [*passed.source.warnings, *counted, *readings.warnings, *on_outlying, *remarks, *notes]
     agreement = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
     return result.changed(
-        counts=passed.counts,
-        readings=readings,
-        warnings=tuple(warnings),
-        outlying=outlying,
-        consistency=agreement,
+        counts=passed.counts, readings=readings, warnings=tuple(warnings), outlying=outlying, consistency=agreement
     )
 
 

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import IN_MEMORY, ROUNDING, Floats
+from kf_calib.bench.arrays import IN_MEMORY, ROUNDING, Floats, portions
 from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.table import DwellTable
@@ -65,10 +65,9 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
         np.where(scaled - cells < 0.5, -strides, strides),
         np.array([*itertools.product((0, 1), repeat=widest.shape[1])]),
     )
-    for first in range(0, len(places), _DWELLS):
-        part = slice(first, first + _DWELLS)
+    for part in portions(len(places), _DWELLS):
         around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
-        for k, near in enumerate(around.tolist(), first):
+        for k, near in enumerate(around.tolist(), part.start):
             nearby = [number for cell in near if cell in at for number in at[cell]]
             close = [number for number in nearby if abs(other[groups[number][0]] - other[k]) < apart]
             joined = [number for number in close if (np.abs(places[groups[number][0]] - places[k]) < apart).all()]
@@ -144,7 +143,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     states, roots = estimates
     design, extra = means.design, considered_information(noise, means, linearised.state)
     spreads = mean_covariances(noise, means, linearised.state)
-    for part in (slice(k, k + _DWELLS) for k in range(0, len(place), _DWELLS)):
+    for part in portions(len(place), _DWELLS):
         ours = design[part] @ roots.of(place[part])
         spreads[part] += ours @ np.swapaxes(ours, 1, 2)
     if extra.any():
@@ -173,7 +172,7 @@ class _OfGroups:
         """Groups (g,) of one size at a time, not too many, and the places (g, m) of their rows."""
         for size in np.unique(self.sizes).tolist():
             groups = np.flatnonzero(self.sizes == size)
-            for chosen in (groups[k : k + _DWELLS] for k in range(0, len(groups), _DWELLS)):
+            for chosen in (groups[part] for part in portions(len(groups), _DWELLS)):
                 yield chosen, self.firsts[chosen, None] + np.arange(size)
 
     def of(self, groups: NDArray[np.intp]) -> Floats:

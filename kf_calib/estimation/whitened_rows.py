@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import IN_CACHE, ROUNDING, Floats
+from kf_calib.bench.arrays import IN_CACHE, ROUNDING, Floats, portions
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
@@ -163,7 +163,7 @@ def _batches(table: DwellTable, width: int) -> Iterator[_Batch]:
     """Group dwells whose rows have one shape, limited so that their ``width`` columns fit into the cache."""
     for number, shape in enumerate(table.folded.shapes):
         most = max(IN_CACHE // (3 * shape.pieces.shape[1] * table.folded.width * (width + 1)), 1)
-        yield from (_Batch(table, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
+        yield from (_Batch(table, number, part) for part in portions(len(shape.dwells), most))
 
 
 def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, int]:

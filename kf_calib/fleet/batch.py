@@ -51,8 +51,9 @@ from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import run_date
+from kf_calib.support.json_values import json_value
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""

@@ -252,10 +252,8 @@ class SequentialTest:
         """
         with one_blas_thread():
             like = None if fitted is None else fitted.dwells
-            recursive = self.recursive.after(
-                dwell, exact=False, like=like
-            ).lean()  # built again when a quarter is added
-            if len(recursive.dwells) < _GROWN * self.fitted_at:
+            recursive = self.recursive.after(dwell, exact=False, like=like).lean()
+            if len(recursive.dwells) < _GROWN * self.fitted_at:  # else it is built again
                 return replace(self, recursive=recursive)._tested()
             recursive, fitted_at, tests = _begun(dwells or recursive.dwells, self.bench, self.settings, fitted)
             return replace(self, recursive=recursive, fitted_at=fitted_at, tests=tests)._tested()

@@ -66,10 +66,7 @@ def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]
     for key, words in _NOTES.items():
         yield words, bench.notes.get(key, "")
     used = counts.used - counts.gated
-    yield (
-        "Readings",
-        f"{used} of {counts.read} used; {counts.moving} moving, {counts.settling} settling",
-    )
+    yield "Readings", f"{used} of {counts.read} used; {counts.moving} moving, {counts.settling} settling"
     last = dwells[-1].end_s
     yield "Dwells", f"{len(dwells)} in {len(orientations(dwells))} orientations, over {_duration(last)}"
     yield "Gimbals", _gimbals(result)

@@ -13,9 +13,9 @@ from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.json_values import json_value
 from kf_calib.support.units import shown
 from kf_calib.views.diagnosis import explains
-from kf_calib.views.json import json_value
 from kf_calib.views.notation import unit_across
 
 _DIGITS = 5  # significant ones, which a page needs

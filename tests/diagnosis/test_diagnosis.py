@@ -114,9 +114,9 @@ def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
 
 def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Object and report read what the diagnosis has worked out once: without its functions they say the same."""
+    from kf_calib.support.json_values import json_value
     from kf_calib.views.console import plain
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
-    from kf_calib.views.json import json_value
 
     found = unlisted()
     shown, printed = json_value(diagnosis_object(found)), plain(diagnosis_report(found, details=True))

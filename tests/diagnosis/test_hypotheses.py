@@ -23,9 +23,9 @@ from kf_calib.effects import effect_named, names
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.results import Calibration
 from kf_calib.sources.files.recording import Recording
+from kf_calib.support.json_values import json_value
 from kf_calib.support.tail_probabilities import log_odds_of
 from kf_calib.views.diagnosis import diagnosis_object
-from kf_calib.views.json import json_value
 
 FAMILIES = {
     "bias in time", "scale in time", "temperature", "nonlinearity", "cross-axis", "memory", "gimbal and encoder",

@@ -183,7 +183,7 @@ def test_what_is_rounding_beside_others_explains_nothing() -> None:
 def test_beside_causes_that_nobody_knows_half_of_a_gain_counts(stated: bool, posterior: RunPosterior) -> None:
     """Beyond stated noise; where it was not stated it is noise, and all of the gain counts."""
     noise = calibrate(Run(seed=4, dwells=12, stated=stated)).noise
-    sizes = NoiseSizes(posterior._run.likelihood, noise.without_estimates(), 24)
+    sizes = NoiseSizes(posterior._run.likelihood, noise.without_estimates(), 24, {})
     known = {"setting"} if stated else set[str]()  # the scatter is not stated
     shapes = [family.shapes for family in sizes.families[1:]]
     logs = [posterior._run.likelihood.in_noises(of_family, sizes.squares).logs for of_family in shapes]

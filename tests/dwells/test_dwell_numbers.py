@@ -12,9 +12,10 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
+from kf_calib.support.json_values import json_value
 from kf_calib.views import console
 from kf_calib.views.diagnosis import diagnosis_report
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 from kf_calib.views.live import objects
 from kf_calib.views.rerun.series import ORIENTATION, VisitHistory, ends
 

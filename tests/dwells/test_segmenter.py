@@ -270,12 +270,7 @@ def test_bad_samples_are_dropped_and_counted() -> None:
     times[30] += 3600 * S  # a damaged stamp far ahead
     got = spans(Given(Batch(Stream(times, accel.values), pose)))
     counts = spans.counts
-    assert (counts.not_finite, counts.repeated, counts.backward, counts.leaping) == (
-        2,
-        1,
-        1,
-        1,
-    )
+    assert (counts.not_finite, counts.repeated, counts.backward, counts.leaping) == (2, 1, 1, 1)
     assert counts.used == 2000 - 5 and len(got) == 1
     said = " ".join(counts.sentences())
     assert "NaN" in said and "jumped back" in said and "repeated the stamp" in said and "far ahead" in said
@@ -290,12 +285,7 @@ def test_what_nothing_can_read_is_dropped_and_told(size: float) -> None:
     batch = Batch(altered.accel, altered.pose, heat)
     result = calibrate(Given(batch, bench=run.bench))
     counts = result.counts
-    assert (
-        counts.too_large,
-        counts.poses_dropped,
-        counts.temperatures_dropped,
-        counts.not_finite,
-    ) == (1, 1, 1, 0)
+    assert (counts.too_large, counts.poses_dropped, counts.temperatures_dropped, counts.not_finite) == (1, 1, 1, 0)
     said = " ".join(result.warnings)
     assert "readings beyond 1e+12 m/s^2, which nothing can read, dropped: 1" in said
     assert "beyond 1e+06 rad" in said and "temperatures not finite or beyond 1e+06 degC, dropped: 1" in said

@@ -26,8 +26,9 @@ from kf_calib.online.session import Session
 from kf_calib.online.status import Judgement, RunStatus
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import opened
+from kf_calib.support.json_values import json_value
 from kf_calib.views.exchange import verification_object
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 from kf_calib.views.live.objects import live_object
 
 printed = CommandLine().json

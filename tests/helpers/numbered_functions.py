@@ -23,7 +23,7 @@ from kf_calib.fleet.text import pooled_objects
 from kf_calib.noise import allan, banded, noise_of_readings, random_walk
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning import loop
-from kf_calib.views.json import json_value
+from kf_calib.support.json_values import json_value
 
 Numbers = Mapping[str, Any]
 SIZES = np.geomspace(1e-3, 1e3, 40)
@@ -169,10 +169,7 @@ def _spans(segmenter: Segmenter, batch: Batch) -> Numbers:
     """Number, first second, last second and count of each block, and the counts."""
     blocks = [*segmenter.push(batch), *segmenter.finish()]
     spans = [[each.dwell, each.elapsed_s[0], each.elapsed_s[-1], len(each.elapsed_s)] for each in blocks]
-    return {
-        "counts": [each for each in vars(segmenter.counts).values() if isinstance(each, int)],
-        "spans": spans,
-    }
+    return {"counts": [each for each in vars(segmenter.counts).values() if isinstance(each, int)], "spans": spans}
 
 
 def orientations() -> Numbers:

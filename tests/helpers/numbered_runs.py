@@ -15,9 +15,10 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.options import options_from_query, simulation
+from kf_calib.support.json_values import json_value
 from kf_calib.views.diagnosis import diagnosis_object
 from kf_calib.views.improvement import improvement_object
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 
 Numbers = Mapping[str, Any]
 """What is stored of a case: a tree for each command, and the figures of all of the result."""

@@ -27,8 +27,9 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
 from kf_calib.sources.simulation.settings import SimulationOptions
+from kf_calib.support.json_values import json_value
 from kf_calib.views.console import plain
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 from kf_calib.views.live.content import content_of
 from kf_calib.views.live.objects import line, live_object
 from kf_calib.views.live.screen import screen

@@ -52,8 +52,9 @@ from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.support.json_values import json_value
 from kf_calib.views.console import plain
-from kf_calib.views.json import json_value, replay_object
+from kf_calib.views.json import replay_object
 from kf_calib.views.live import objects
 from kf_calib.views.live.content import Doing, content_of
 from kf_calib.views.live.screen import screen

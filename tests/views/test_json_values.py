@@ -10,7 +10,7 @@ import pytest
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.cli.echo import json_line
-from kf_calib.views.json import json_value
+from kf_calib.support.json_values import json_value
 
 
 class Range(NamedTuple):
