@@ -107,7 +107,9 @@ def _what_fails(diagnosis: Diagnosis) -> str:
     """Return what fails: the size of the residuals, or how they scatter, or what shows while the platform turns."""
     test, first = diagnosis.test, diagnosis.likeliest
     if first is not None and first.refit is not None and first.refit.model.dynamic:
-        return "The model agrees at rest; while the platform turns the readings fail"
+        condition = diagnosis.before.consistency.condition
+        at_rest = f"The model agrees at rest{f' if {condition}' if condition else ''}"
+        return f"{at_rest}; while the platform turns the readings fail"
     scattering = test.noise_p is not None and test.noise_p == test.p_value
     return "The dwells do not scatter as noise does" if scattering else "Residuals fail"
 
