@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]

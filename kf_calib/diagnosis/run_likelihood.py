@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import AT_ONCE, Floats, Indices, portions
+from kf_calib.bench.arrays import AT_ONCE, Floats, Indices, Singles, portions
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
@@ -105,7 +105,7 @@ class RunLikelihood:
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
-        self.lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", combined, combined))
+        self.lengths = np.sqrt(_squares(columns) + np.einsum("rc,rc->c", combined, combined))
         more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
         self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
@@ -118,7 +118,7 @@ class RunLikelihood:
 
     def _made(
         self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination], z: Floats, basis: Floats
-    ) -> tuple[Floats, WithinRows]:
+    ) -> tuple[Singles, WithinRows]:
         """Return the columns (D, 3, C) of all terms in the means, and rows within dwells, made for a few dwells at a
         time: their values at all nodes take ten times the memory. z (D, 3): what the model leaves of the means; basis
         (3 D, r): what it spans."""
@@ -127,7 +127,7 @@ class RunLikelihood:
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
-        columns = np.empty((len(dwells), 3, count))
+        columns = np.empty((len(dwells), 3, count), np.float32)
         # chi-squared of the means beyond its expectation, and no less than noise makes of it
         explained = max(float(np.sum(z**2)) - z.size, 0.0) + 3.0 * math.sqrt(2.0 * z.size)
         within = WithinRows(self.noise, linearised, known, np.append(state, np.zeros(made)), explained)
@@ -159,7 +159,7 @@ class RunLikelihood:
     def lengths_left(self) -> Floats:
         """Lengths (C,) of the columns of the terms off the model."""
         columns, more = self.spanned.columns, self.spanned.more_columns
-        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.einsum("rc,rc->c", more, more))
+        return np.sqrt(_squares(columns) + np.einsum("rc,rc->c", more, more))
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
@@ -170,7 +170,7 @@ class RunLikelihood:
     def columns(self, places: Indices) -> Floats:
         """Some columns (r, q) of the terms in the noise that was stated, off the model, in all rows."""
         parts = self.spanned.columns[..., places].reshape(-1, len(places)), self.spanned.more_columns[:, places]
-        return np.concatenate(parts)
+        return np.concatenate(parts, dtype=np.float64)
 
     def in_noises(self, shapes: Floats, squares: Floats, groups: Sequence[Indices] = ()) -> InNoises:
         """The products of the columns of groups (n, q) in noise of some sizes; shapes (D, 3, 3): of unit size."""
@@ -186,7 +186,7 @@ class RunLikelihood:
         """Some columns with further noise, (D, 3, 3) in units of that stated, projected off the model, and off the
         columns ``flat`` of the terms."""
         places, rows = np.unique([*places, *flat]), self.spanned
-        parts = [rows.basis, rows.columns[..., places], rows.readings[..., None]]
+        parts = [rows.basis, rows.columns[..., places].astype(np.float64), rows.readings[..., None]]
         log = rows.log
         if covariances is not None:
             lower = np.linalg.cholesky(lift_rounding(np.eye(3) + covariances))
@@ -236,6 +236,11 @@ class RunLikelihood:
         return (self._root @ made)[..., 0]
 
 
+def _squares(columns: Singles) -> Floats:
+    """Return the squares (C,) of columns (D, 3, C)."""
+    return np.asarray(np.einsum("dic,dic->c", columns, columns, dtype=np.float64))
+
+
 def of_unit_size(shapes: Floats) -> Floats:
     """Return covariances (D, 3, 3) scaled to the noise that was stated."""
     return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
@@ -247,7 +252,7 @@ def _width(block: Combination) -> int:
     return part.stop - part.start if matrix is None else int(matrix.shape[1])
 
 
-def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats) -> None:
+def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats | Singles) -> None:
     """Write combinations of columns (..., C) one behind the other; without any, the columns themselves."""
     if not blocks:
         combined[:] = columns
@@ -259,14 +264,16 @@ def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats) -
 
 
 def _off(
-    model: Floats, columns: Floats, z: Floats, more_model: Floats, more_columns: Floats, more_z: Floats
+    model: Floats, columns: Singles, z: Floats, more_model: Floats, more_columns: Floats, more_z: Floats
 ) -> Spanned:
     """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the columns are
     overwritten."""
     whole = np.concatenate([model.reshape(-1, model.shape[2]), more_model])
     basis, _, log_volume = spanned(whole)
     of_means, more = basis[: z.size].reshape(*z.shape, -1), basis[z.size :]
-    onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
+    onto = more.T @ more_columns
+    for few in portions(len(columns), AT_ONCE // 8):
+        onto += np.tensordot(of_means[few], columns[few], axes=((0, 1), (0, 1)))
     for k in range(len(columns)):
         columns[k] -= of_means[k] @ onto
     for few in portions(len(more), AT_ONCE // 8):
