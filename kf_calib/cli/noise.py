@@ -77,6 +77,7 @@ def noise(
 def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> Source:
     """The recording once more, with the gyroscopes in place of the readings; size: of their unit, rad/s."""
     from kf_calib.sources.file_kind import FileKind
+    from kf_calib.sources.files.mcap_file import McapFile
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.text.lines import Lines
     from kf_calib.sources.text.names import meanings_of
@@ -85,6 +86,7 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
     keys: BenchKeys = {"accel_scale": size, "accel_unit": "m/s2", "restate_input": True}
     if reading.kind(path) is FileKind.RECORDING:
         if ":" not in gyro:
+            McapFile(path)  # refuses what is no such file
             raise InputError(f"--gyro {gyro!r} names no topic: write --gyro TOPIC:X,Y,Z with the paths of the rates.")
         return Recording(path, keys, fields=(f"accel={gyro}",), max_chunk_mb=reading.max_chunk_mb, angles=False)
     names = [name.strip() for name in gyro.split(",")]

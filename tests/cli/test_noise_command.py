@@ -103,6 +103,7 @@ def test_gyroscopes_of_a_bag_are_named_by_their_paths(run: Any, tmp_path: Path) 
     assert channels[0]["white_mps2_per_sqrt_hz"] == pytest.approx(1e-3, rel=0.05)
     assert channels[3]["white_radps_per_sqrt_hz"] == pytest.approx(1e-4, rel=0.05)
     assert "names no topic" in run.refused("noise", bag, "--gyro", "wx,wy,wz")
+    assert "does not exist" in run.refused("noise", bag.with_name("none.mcap"), "--gyro", "wx,wy,wz")
 
 
 def test_what_is_saved_goes_into_other_programs(run: Any, rest: Path) -> None:
