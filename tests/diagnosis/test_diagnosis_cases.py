@@ -108,6 +108,7 @@ def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
     not_wrong(walking(seed), "bias-walk")
 
 
+@pytest.mark.slow
 def test_a_line_is_named_with_its_frequency() -> None:
     _, found = oscillating(LINE)
     assert found.missing == ("sinusoid",) and found.after is not None
@@ -226,6 +227,7 @@ def test_an_oscillation_does_not_stand_for_what_is_left_of_three_effects() -> No
     assert max(row.probability for row in found.table.rows if "sinusoid" in row.effects) < 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size, seed, dwells", [(200, 7, 10), *slow((200, 7, 16), (100, 8, 16), (400, 9, 16))])
 def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: int, seed: int, dwells: int) -> None:
     """Its variance, as if it were noise, is a hundred times that of the noise; the dwells' means say it is none."""
@@ -356,6 +358,7 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     assert found.table is not None and found.table.first.dof == 3 + 1, "coefficients, and the intensity of the walk"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(1, 2), *slow(range(5))])
 def test_a_walk_that_explains_all_gets_no_companion_by_chance(seeds: range) -> None:
     found = [walking(seed) for seed in seeds]

@@ -36,8 +36,8 @@ def diagnosed(seed: int, poses: int, second: float = 0.0, third: float = 0.0, st
     return diagnose(open_table(table, bench), replicate=False)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize("faces", [True, False])
+@pytest.mark.parametrize("stated", [False, *slow(True)])
+@pytest.mark.parametrize("faces", [False, *slow(True)])
 @pytest.mark.parametrize("seed", [0, *slow(1)])
 def test_noise_of_few_poses_is_no_effect(seed: int, faces: bool, stated: bool) -> None:
     for poses in (6, 8):
@@ -55,8 +55,8 @@ def test_six_faces_do_not_tell_what_is_the_same_there(seed: int, stated: bool) -
     assert found.table.probability(found.table.first.effects) < SURE
 
 
-@pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize(("second", "third"), [(1e-2, 0.0), (0.0, 1e-2)])
+@pytest.mark.parametrize("stated", [False, *slow(True)])
+@pytest.mark.parametrize(("second", "third"), [(1e-2, 0.0), *slow((0.0, 1e-2))])
 @pytest.mark.parametrize("seed", [3, *slow(0, 1, 2)])
 def test_no_dwell_of_six_is_wrong_for_an_effect(seed: int, second: float, third: float, stated: bool) -> None:
     """Two of six were wrong with over 99.9 %, as they explain all that is left of one accelerometer."""
@@ -72,6 +72,7 @@ def test_an_effect_of_one_accelerometer_is_named_by_few_poses(poses: int, seed: 
     assert found.table.probability(("second-order",)) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not BROAD.exists(), reason=f"{BROAD} is not here")
 def test_an_effect_with_which_a_run_tells_nothing_is_no_explanation() -> None:
     """Nearly level rests of a sensor in the hand (D. Laidig et al., BROAD), some of them moving: with `cross-talk`,

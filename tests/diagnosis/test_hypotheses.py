@@ -209,6 +209,7 @@ def test_what_an_effect_leaves_is_tested_in_the_noise_that_it_leaves() -> None:
     assert again.consistency.consistent is False
 
 
+@pytest.mark.slow
 def test_a_constant_that_the_run_does_not_tell_is_no_value_to_be_weighed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -109,6 +109,7 @@ def test_what_no_effect_of_the_catalogue_is_gets_no_name(driver: str) -> None:
     assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == driver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(1,), *slow(range(2, 8))])
 def test_a_bias_that_toggles_by_chance_has_no_name_but_its_accelerometer(seeds: Sequence[int]) -> None:
     """As by a bad contact. Where scatter was that of all accelerometers, such a run was told as ``magnetic`` with
@@ -207,6 +208,7 @@ def test_a_warm_up_that_is_over_after_few_dwells_is_named_alone(time_constant_s:
         assert abs(constant.value - time_constant_s) < 0.02 * time_constant_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time_constant_s, seeds", [(3.5, range(2, 3)), *slow((2.8, range(1, 7)), (3.5, range(1, 7)))])
 def test_what_decays_after_every_arrival_is_no_warm_up(time_constant_s: float, seeds: range) -> None:
     """The first dwell alone looks like one; "part of it: warm-up (99.5 %)" made the error on dwells left out 6 times as
@@ -227,6 +229,7 @@ def walking(seed: int, sizes: tuple[float, float, float], state: State) -> np.nd
     return np.cumsum(normal * np.sqrt(np.gradient(state.time_s))[:, None], axis=0) * np.array(sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dwells", "sizes"), [
     (12, (0.0, 1e-5, 0.0)), *slow((24, (1e-5, 0.0, 0.0)), (16, (0.0, 0.0, 1e-5)), (24, (2e-6, 7e-6, 1e-6)),
                                   (12, (1e-5, 3e-6, 5e-6))),
@@ -242,6 +245,7 @@ def test_a_walk_is_named_whichever_accelerometer_walks(
         assert diagnosis.missing == ("bias-walk",), diagnosis.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [31, *slow(32, 33)])
 def test_what_changes_smoothly_in_a_way_that_nobody_knows_is_no_walk(seed: int) -> None:
     def rising(state: State) -> np.ndarray:
@@ -267,6 +271,7 @@ def test_a_fault_of_no_catalogue_has_no_known_name(name: str) -> None:
                 "scale-warm-up", "platform-drift", "base-tilt", "cross-axis-square")), default=0.0) < 0.5  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gimbal", "dwells", "bench"), [
     (3, 12, UNSTATED), *slow((3, 24, UNSTATED), (2, 12, UNSTATED), (2, 24, BENCH), (3, 12, BENCH), (3, 24, BENCH)),
 ])  # fmt: skip
@@ -300,6 +305,7 @@ def test_constants_of_two_effects_are_those_beside_each_other() -> None:
         assert abs(found.value - 100.0) < 4.0 * found.sigma < 100.0
 
 
+@pytest.mark.slow
 def test_a_run_that_agrees_without_its_vibration_says_so_first() -> None:
     """A platform that rings after its moves."""
 

@@ -42,6 +42,7 @@ def test_what_shows_in_slews_alone_is_named(hidden: str, symbol: str, truth: flo
         assert abs(own.value - alone.value) < alone.sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [[], *slow(["latency=0.02"])])
 def test_agreement_at_rest_that_was_not_stated_is_said_first(hidden: list[str]) -> None:
     run = short_run({"gravity_mps2": "9.81"}, seed=3, slew_degps=30.0, count=16, setting_sigma_deg=0.3)

@@ -105,6 +105,7 @@ def test_other_kinds_of_effects(name: str) -> None:
     assert ratio(state.result) < 1.3
 
 
+@pytest.mark.slow
 def test_two_effects_are_added_one_by_one() -> None:
     state = improve(source("hysteresis=15sigma", "thermal-scale=15sigma"))
     assert {step.added for step in state.steps} == {"hysteresis", "thermal-scale"} and len(state.steps) == 2
@@ -174,6 +175,7 @@ def test_a_result_shows_what_it_is_and_not_its_arrays(improved: Improvement) -> 
     assert max(len(repr(each)) for each in (found, improved, found.before, found.before.visits[0], found.test)) < 20_000
 
 
+@pytest.mark.slow
 def test_undo_and_drop(improved: Improvement) -> None:
     start = Improvement(improved.start)
     taken = take_step(take_step(start, Refits(), "mine = fx*fz", None, "user"), Refits(), "second-order", None, "user")

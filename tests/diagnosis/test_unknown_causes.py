@@ -55,6 +55,7 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
     assert diagnosis.description is not None and diagnosis.description.share > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "driver"),
     [
@@ -274,6 +275,7 @@ def test_an_oscillation_of_any_frequency_is_a_sum_of_neighbouring_ones(cycles: f
     assert min(left) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [77001, *slow(77010)])
 def test_a_saturating_hysteresis_of_300_sigma_is_two_functions_of_the_last_step_and_no_settling(seed: int) -> None:
     """Its shape is between two of those that are tried."""
@@ -299,6 +301,7 @@ def _density(x: float, usual: SizePrior) -> float:
     return float(np.exp(-max(low - x, x - high, 0.0)) / (high - low + 2.0))
 
 
+@pytest.mark.slow
 def test_an_effect_that_only_an_absurd_size_would_show_is_no_explanation() -> None:
     """Nearly level poses: what turns the platform about the vertical shows by radians only."""
     rng = np.random.default_rng(4)

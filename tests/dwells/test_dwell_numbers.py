@@ -58,6 +58,7 @@ def test_the_rerun_timeline_counts_by_these_numbers(result: Calibration) -> None
     assert history.after(()).orientation.tolist() == history.orientation.tolist()
 
 
+@pytest.mark.slow
 def test_the_table_of_a_diagnosis_names_dwells_by_these_numbers() -> None:
     spoilt = run()
     at = slice(6 * COUNT - COUNT + 9, 7 * COUNT - COUNT + 9)  # of the seventh dwell

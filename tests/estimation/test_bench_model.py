@@ -54,6 +54,7 @@ def _with(*sizes: float) -> Estimate:
     return calibrate(RECORDING, Settings(bench_model=BenchModel((term,)))).estimate
 
 
+@pytest.mark.slow
 def test_commands_take_a_bench_model_and_say_so(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     MODEL.write(path)

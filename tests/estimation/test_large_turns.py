@@ -65,6 +65,7 @@ def test_engines_agree_where_a_large_turn_meets_setting_errors_and_where_it_does
         assert way.max_difference_sigma <= 1e-6 and way.max_relative_variance <= 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden, states",
     [

@@ -164,6 +164,7 @@ def test_an_oscillation_that_goes_on_in_all_dwells_is_steady(count: int) -> None
     assert stats.kstest([p_of_steady_oscillation(fit) for fit in fits], "uniform").pvalue > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *slow(2, 3, 5)])
 def test_what_swings_in_one_dwell_alone_is_no_oscillation_of_the_run(seed: int) -> None:
     """Creep and what goes on around a bench swing for a while; an effect of the sensor goes on."""

@@ -57,6 +57,7 @@ def test_each_run_has_the_numbers_that_it_has_alone(campaign: Path, run: Any, tm
     assert row["date"].isoformat(timespec="seconds") == "2025-10-15T07:06:40+00:00"  # a third of a year after the first
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
     campaign: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:

@@ -63,6 +63,7 @@ def with_limit(kind: type[RunEvaluation], limit_s: float) -> RunEvaluation:
     return kind.of(ReadingOptions(), EvaluationOptions(), limit_s)
 
 
+@pytest.mark.slow
 def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(
     runs: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:

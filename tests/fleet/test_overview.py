@@ -27,6 +27,7 @@ def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("bent"), runs=3, units=3, dwells=9, of_bench=("flexure=8sigma",))
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any, tmp_path: Path) -> None:
     printed = run.json("fleet", bent, "-o", tmp_path / "fleet")
     first, *others = printed["pooled"]

@@ -249,6 +249,7 @@ class Repeated(Resting):
                 yield Batch(Stream(batch.accel.time_ns + k * lasts_ns, batch.accel.values), batch.pose)
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_a_short_rest_however_long_it_is() -> None:
     """Both have as many of the longest blocks, 625."""
 

@@ -128,6 +128,7 @@ def test_live_is_replay_to_the_bit_and_a_judgement_a_dwell() -> None:
     assert session.standing.samples == found[-1].result.counts.read and session.standing.dwells == 7
 
 
+@pytest.mark.slow
 def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_restart() -> None:
     session = Session(bench("hysteresis=40sigma", orientations=10), auto=True)
     found = judgements(session)

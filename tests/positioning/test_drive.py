@@ -164,6 +164,7 @@ def test_a_budget_of_time_ends_the_run() -> None:
     assert outcome.ended == "budget" and 60.0 < outcome.lasted_s < 90.0
 
 
+@pytest.mark.slow
 def test_a_bench_with_backlash_overshoot_and_noise_is_driven_to_the_end() -> None:
     servo = Servo(overshoot_deg=0.3, backlash_deg=0.001, position_sigma_deg=0.002, rate_degps=35.0)
     drive = driven(servo=servo, keys={"rate_degps": "35", "angle_sigma_deg": "0.001"}, targets=("K=10ppm",))

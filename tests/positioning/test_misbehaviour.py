@@ -104,6 +104,7 @@ def halted(table: Table, folder: Path, after_s: float, misbehaviour: str) -> Dri
         return drive
 
 
+@pytest.mark.slow
 def test_a_table_that_ignores_the_stop_is_said_to_move(table: Table, tmp_path: Path) -> None:
     drive = halted(table, tmp_path, 0.3, "ignores-stop")
     assert drive.outcome is not None and not drive.outcome.stopped

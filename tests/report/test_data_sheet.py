@@ -47,6 +47,7 @@ def sheet_of(source: Any) -> DataSheet:
     return data_sheet(diagnose(calibrate(source), refits), refits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(1), *slow(range(10, 30))])
 def test_coefficients_are_within_their_sigmas(seeds: range) -> None:
     scores = list[float]()

@@ -334,6 +334,7 @@ def test_a_table_without_angles_gives_what_least_squares_of_the_norms_gives(
     assert run.parameters("replay", path, *BY_HAND)["K1"]["sigma"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_table_with_faces_may_do_without_them(run: Any) -> None:
     twelve = ROOT / "recordings" / "twelve_poses.csv"
     found = run.json("replay", twelve, "--no-angles", "--gravity", "9.8123")

@@ -11,6 +11,7 @@ from kf_calib.errors import InputError
 from kf_calib.support import output_files
 
 
+@pytest.mark.slow
 def test_no_cut_takes_what_was_on_the_disk_or_makes_up_what_was_not() -> None:
     wrong = {number: said for number in range(150) if (said := power_cuts.play(number, seed=57))}
     assert not wrong, f"play one again: tools/power_cuts.py --seed 57 --only {next(iter(wrong))}"

@@ -39,6 +39,7 @@ def test_a_row_is_labelled_as_a_truth_is() -> None:
     assert label_of(Hypothesis(families=(NOTHING,))) == "nothing" and label_of(Hypothesis(driver=IRREGULAR)) == "noise"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [10, *slow(13, 16)])
 def test_what_is_drawn_is_in_the_readings(seed: int) -> None:
     """A run of one effect that is named: the same seed gives the same row, and the coefficients have ranks."""

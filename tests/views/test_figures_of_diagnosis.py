@@ -178,6 +178,7 @@ def test_errors_fall_in_the_figure_as_in_the_result() -> None:
     assert left < 0.0 < right and below.get_xlabel() == "coefficient ± 1σ and 2σ, µg/g²"
 
 
+@pytest.mark.slow
 def test_undone_steps_and_choices_left_open_have_columns() -> None:
     refits = Refits()
     state = extend(begin(run("bias-drift=15sigma"), refits), refits, ("second-order",), "user")
@@ -245,6 +246,7 @@ def slipped() -> Altered:
     return Altered(made, readings)
 
 
+@pytest.mark.slow
 def test_a_disturbed_dwell_is_drawn_reading_by_reading_from_its_arrival_on() -> None:
     diagnosis = diagnose(slipped())
     title, draw = next(iter(plot.figures(diagnosis).items()))
@@ -282,6 +284,7 @@ def test_an_effect_with_a_constant_of_its_own_is_a_line_over_what_the_fit_made_o
         assert np.abs(component - line).max() < 1e-3 * np.ptp(component)
 
 
+@pytest.mark.slow
 def test_what_the_verdict_does_not_name_has_no_picture() -> None:
     """Dwells that scatter: the likeliest effect is in the list of suspects, and not what the residuals are drawn as."""
     diagnosis = diagnose(noisy_source(scatter_mps2=3e-5, states={"scatter_sigma_mps2": 0.0}))
@@ -291,6 +294,7 @@ def test_what_the_verdict_does_not_name_has_no_picture() -> None:
     assert titles[0] == "Residuals of twelve parameters" and not any("must explain" in title for title in titles)
 
 
+@pytest.mark.slow
 def test_bars_of_noise_alone_stand_before_those_of_the_scatter_that_was_estimated() -> None:
     diagnosis = diagnose(noisy_source("second-order=60sigma", scatter_mps2=3e-5, states={"scatter_sigma_mps2": None}))
     shape = diagnosis.explanations[0].shapes[0]

@@ -72,6 +72,7 @@ def test_page_and_terminal_show_the_same_texts_of_a_bench() -> None:
     assert [row["bar"]["share"] <= 0.0 for row in made["rows"] if row["bar"]["has_target"]] == [False, True]
 
 
+@pytest.mark.slow
 def test_directions_are_those_of_the_dwells_of_the_open_one_and_of_the_next() -> None:
     session = Session(Run(dwells=8, count=60))
     seen = []
@@ -178,6 +179,7 @@ def results(objects: str) -> dict[str, Any]:
     return {key: value for key, value in last.items() if key not in ("source", "time_left_s")}
 
 
+@pytest.mark.slow
 def test_dead_and_slow_browsers_leave_the_run_as_it_is() -> None:
     plainly = subprocess.run(warm("live", RUN, "--json"), capture_output=True, text=True, timeout=120)
     with live(RUN, "--json") as (process, port):
@@ -235,6 +237,7 @@ DETERMINED = "document.querySelectorAll('#sigmas .bar, #sigmas .reached').length
 OVER = "document.querySelector('#what').textContent === 'THE RUN HAS ENDED'"
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_phone_and_a_large_screen_in_light_and_dark(browser: Any) -> None:
     with live(SLOW, "--target", "K=2ppm", "--json", stdout=subprocess.DEVNULL) as (process, port):
         visits = [
