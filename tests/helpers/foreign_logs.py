@@ -123,6 +123,12 @@ COMMA_TABLES: Mapping[str, Callable[[], Columns]] = {
         **three("ACCELEROMETER {} (m/s²)", readings(), "XYZ"), **rates("GRAVITY {} (m/s²)", "XYZ"),
         **rates("GYROSCOPE {} (rad/s)", "XYZ"), **rates("MAGNETIC FIELD {} (μT)", "XYZ"),
         **rates("ORIENTATION {} (°)", "XYZ")},
+    "WitMotion with a clock": lambda: {
+        "Time(s)": [f"09:{30 + int(at) // 60}:{at % 60.0:06.3f}" for at in SECONDS.tolist()],
+        **three("a{}(g)", readings() / G, form="{:.12f}"), **rates("w{}(deg/s)"), **constant("21.5", "T(°)")},
+    "a table of Grafana": lambda: {
+        "Time": [f"2026-05-27 09:{30 + int(at) // 60}:{at % 60.0:06.3f}" for at in SECONDS.tolist()],
+        **three("a{}", readings(), form='"{:.9f} m/s²"'), **constant("21.5 °C", "temperature")},
     "a simulator with its truth": lambda: {
         "time_s": texts(SECONDS, "{:.2f}"), **rates("{}_true (g)"),
         **three("{}_mean (g)", readings() / G, form="{:.12f}")},
@@ -150,6 +156,25 @@ def bare_numbers() -> str:
         f"{at:.2f} {' '.join(f'{value:.9f}' for value in force)} {' '.join(f'{value:.4f}' for value in other)}\n"
         for at, force, other in rows
     )
+
+
+def below_a_rate() -> str:
+    """As MT Manager writes the counters of a DOT, whose unit no name tells: the rate stands above."""
+    counters = {"PacketCounter": texts(range(COUNT), "{:05d}"), "SampleTimeFine": texts(1e4 * SECONDS, "{:.0f}")}
+    table = comma_table({**counters, **three("Acc_{}", readings(), "XYZ"), **rates("Gyr_{}", "XYZ")})
+    return f"// Start Time: Unknown\n// Sample rate: {RATE_HZ}.0Hz\n// Firmware Version: 2.0.1\n{table}"
+
+
+def dictionaries() -> str:
+    """Dictionaries as Python prints them, with numbers of numpy."""
+    rows = zip(SECONDS.tolist(), readings().tolist(), strict=True)
+    return "".join(f"{{'t': np.float64({at:.2f}), 'acc': {force}, 'temperature': None}}\n" for at, force in rows)
+
+
+def line_protocol() -> str:
+    """Lines of a database of time series."""
+    rows = zip(stamps_ns(), readings().tolist(), strict=True)
+    return "".join(f"imu,sensor=mpu ax={x},ay={y},az={z} {at_ns}\n" for at_ns, (x, y, z) in rows)
 
 
 def json_array() -> str:
@@ -317,6 +342,9 @@ FOREIGN_LOGS: Mapping[str, ForeignLog] = {
     **{name: ForeignLog("log.csv", _texts_of(columns)) for name, columns in COMMA_TABLES.items()},
     "a German Excel": ForeignLog("log.csv", lambda path: path.write_text(german_table(), encoding="cp1252")),
     "numbers alone": ForeignLog("log.txt", lambda path: path.write_text(bare_numbers())),
+    "a rate above the names": ForeignLog("log.csv", lambda path: path.write_text(below_a_rate())),
+    "dictionaries of Python": ForeignLog("log.txt", lambda path: path.write_text(dictionaries())),
+    "InfluxDB": ForeignLog("log.txt", lambda path: path.write_text(line_protocol())),
     "JSON lines": ForeignLog("log.jsonl", lambda path: path.write_text(json_lines())),
     "an array of JSON": ForeignLog("log.json", lambda path: path.write_text(json_array())),
     "ros2 topic echo": ForeignLog(

@@ -190,6 +190,8 @@ class Columns:
             return Stamps((), (), rate_hz=self.units.rate_hz)
         filled = [at for at in self.places("time") if any(row[at].lower() not in NOTHING for row in self.rows)]
         places = filled if self.rows else self.places("time")
+        if not places and self.heading.rate_hz is not None:
+            return self._at_stated_rate()
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
@@ -199,6 +201,8 @@ class Columns:
         ways = [way for at in exact or places if (way := self._stamps_in(at, places))]
         if parts := self._parts_of_time(ways):
             ways.append(parts)
+        if not ways and self.heading.rate_hz is not None:
+            return self._at_stated_rate()
         if not ways:
             raise self._without_time(places[0])
         stamps = min(ways, key=self._unevenness) if len(ways) > 1 else ways[0]
@@ -209,11 +213,17 @@ class Columns:
             self.said.append(f"time from {self.named(stamps.at)}{unit}{zone}")
         return stamps
 
+    def _at_stated_rate(self) -> Stamps:
+        """Return the time by the rate of the rows that is stated above their names."""
+        rate_hz = self.heading.rate_hz
+        self.said.append(f"time from the numbers of the rows, {rate_hz:g} of them a second, as is stated above them")
+        return Stamps((), (), rate_hz=rate_hz)
+
     def _stamps_in(self, place: int, places: Sequence[int]) -> Stamps | None:
         """How stamps in a column are written, of which the next of ``places`` may have the time of day; None where this
         or their unit is not told."""
         first = next((row[place] for row in self.rows if row[place]), "0")
-        if self.meanings[place].unit or not math.isnan(self.numbers.value(first)):
+        if not math.isnan(self.numbers.value(first)) or (self.meanings[place].unit and not are_stamps([first])):
             unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
             return Stamps((place,), (round(names.TIME[unit] * 1e9),)) if unit else None
         both = places[:2] if place == places[0] else [place]
@@ -417,12 +427,13 @@ class Columns:
                 self._guess(k, ours)
 
     def _are_stamps(self, place: int) -> bool:
-        """Whether a column holds stamps of a calendar or, without a name, seconds that go up."""
+        """Whether a column holds stamps of a calendar or, without a name, seconds or stamps since 1970 that go up."""
         if not (self.rows and self._are_numbers(place)):
             return are_stamps([row[place] for row in self.rows])
-        steps = np.diff(self._finite(place))
+        values = self._finite(place)
+        steps, since_1970 = np.diff(values), names.unit_of_epoch(float(values.max(initial=0.0)))
         return self.header[place] in ("", names.NAMELESS.format(place + 1)) and bool(
-            (steps > 0.0).all() and (steps % 1.0).any()
+            (steps > 0.0).all() and (since_1970 or (steps % 1.0).any())
         )
 
     def _guess(self, place: int, ours: str) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from kf_calib.sources.text.cells import are_stamps
-from kf_calib.sources.text.names import READINGS, face_of, is_unit, meanings_of, nameless
+from kf_calib.sources.text.names import READINGS, face_of, is_unit, meaning_of, meanings_of, nameless
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -34,8 +34,11 @@ _IN_TEXT = re.compile(
 _LABEL = re.compile(r"([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*[(\[]?\s*$")
 _UNIT_BEHIND = re.compile(r"\s*([^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])")
 _FEWEST_LABELS, _LONGEST_LABELLED, _LONGEST_LABEL = 3, 1000, 60
-_JSON = "{"
-_JSON_TOKEN = re.compile(r'"((?:[^"\\]|\\.)*)"(\s*:)?|[{}\[\],]|[^\s{}\[\],:"]+')
+_JSON, _QUOTES = "{", "\"'"
+_JSON_TOKEN = re.compile(r"""(["'])((?:(?!\1)[^\\]|\\.)*)\1(\s*:)?|[{}\[\],]|[^\s{}()\[\],:"']+""")
+"""A text, as Python prints it perhaps in single quotes, a mark, or a number."""
+_QUANTITY = re.compile(rf"(?:{_NUMBER.pattern})\s*([^\d\s.,].*)", re.IGNORECASE)
+_RATE = re.compile(r"(?:rate|sampl\w*|(?<!pass )\bat)\b[^\d\n]{0,30}?(\d+(?:[.,]\d+)?)\s*Hz\b", re.IGNORECASE)
 
 
 class TextHeading(NamedTuple):
@@ -43,7 +46,8 @@ class TextHeading(NamedTuple):
 
     lines_of_names: numbers, from 0, of the line with the names and, where there is one, of that with units. labels:
     the names in each line that has readings, where each value has its name before it. numbers: of the lines of the
-    rows, from 0.
+    rows, from 0. suffixes: the unit that each cell of a column has behind its number. above: what stands above the
+    names.
     """
 
     header: Sequence[str]
@@ -53,6 +57,8 @@ class TextHeading(NamedTuple):
     lines_of_names: tuple[int, ...] = ()
     labels: Sequence[str] = ()
     numbers: Sequence[int] = ()
+    suffixes: Sequence[str] = ()
+    above: Sequence[str] = ()
 
     @classmethod
     def of(cls, lines: Sequence[str], *, is_whole: bool = False) -> TextHeading:
@@ -73,6 +79,7 @@ class TextHeading(NamedTuple):
         heading = cls.of_cells(cells, delimiter)
         if count := _numbers_amid(lines[:_ROWS], heading):
             return cls._of_labelled(lines, [""] * count, nameless(count), is_whole)
+        heading = heading._replace(above=lines[: heading.lines])
         return heading if is_whole else heading._replace(rows=heading.rows[:_ROWS])
 
     @classmethod
@@ -81,7 +88,7 @@ class TextHeading(NamedTuple):
         for three readings."""
         found = [{path: line[start:end] for path, start, end in scalars(line)} for line in lines[:_ROWS]]
         header = list(dict.fromkeys(path for cells in found for path in cells if path))
-        rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
+        rows = [[cells.get(path, "").strip(_QUOTES) for path in header] for cells in found]
         if len(header) < _FEWEST_CELLS:
             return None
         return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows)))
@@ -96,7 +103,11 @@ class TextHeading(NamedTuple):
         rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not _is_comment(own)]
         behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
         names = tuple(filled[k][0] for k in named)
-        return cls(header, delimiter, behind, [own for _, own in rows], names, numbers=[k for k, _ in rows])
+        suffixes = _suffixes_in([own for _, own in rows], len(header))
+        named = zip(header, suffixes, strict=True)
+        header = [f"{name} [{unit}]" if unit and not meaning_of(name).unit else name for name, unit in named]
+        values = [_without(own, suffixes) for _, own in rows]
+        return cls(header, delimiter, behind, values, names, numbers=[k for k, _ in rows], suffixes=suffixes)
 
     @classmethod
     def _of_labelled(cls, lines: Sequence[str], labels: list[str], header: list[str], is_whole: bool) -> TextHeading:
@@ -115,6 +126,12 @@ class TextHeading(NamedTuple):
         return cls(header, ",", numbers[0], rows, labels=labels, numbers=numbers)
 
     @property
+    def rate_hz(self) -> float | None:
+        """The rate of the rows that the lines above the names state; None where none does, or several."""
+        rates = {match[1].replace(",", ".") for line in self.above for match in _RATE.finditer(line)}
+        return float(rates.pop()) if len(rates) == 1 else None
+
+    @property
     def has_objects(self) -> bool:
         """Whether each line below is an object of JSON."""
         return self.delimiter == _JSON
@@ -122,8 +139,8 @@ class TextHeading(NamedTuple):
     def cells(self, line: str) -> list[str]:
         """The cells of a line below; none where it has other labels than those of readings."""
         if self.labels:
-            return [line[start:end].strip('"') for start, end in self.spans(line)]
-        return cells_of(line, self.delimiter)
+            return [line[start:end].strip(_QUOTES) for start, end in self.spans(line)]
+        return _without(cells_of(line, self.delimiter), self.suffixes)
 
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
@@ -141,9 +158,11 @@ class TextHeading(NamedTuple):
         mark = re.escape(self.delimiter)  # which a quoted cell may hold; a quote left open ends with the line
         cell = rf'(?:^|{mark})((?:"(?:[^"]|"")*+"?)?[^{mark}]*)'
         cells = [(match[1], *match.span(1)) for match in re.finditer(cell, line)]
-        return [
+        spans = [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
+        padded = itertools.chain(self.suffixes, itertools.repeat(""))
+        return [_number_in(line, span, unit) if unit else span for span, unit in zip(spans, padded, strict=False)]
 
 
 def scalars(line: str) -> list[tuple[str, int, int]]:
@@ -151,15 +170,15 @@ def scalars(line: str) -> list[tuple[str, int, int]]:
     does not end there are none: the last number may lack digits."""
     keys, places = list[str | int](), list[tuple[str, int, int]]()
     for match in _JSON_TOKEN.finditer(line):
-        if match[2] and keys:
-            keys[-1] = match[1]
+        if match[3] and keys:
+            keys[-1] = match[2]
         elif match[0] in ("{", "["):
             keys.append("" if match[0] == "{" else 0)
         elif match[0] in ("}", "]"):
             del keys[-1:]
         elif match[0] == ",":
             keys[-1:] = [key + 1 if isinstance(key, int) else key for key in keys[-1:]]
-        elif match[0] != "null":
+        elif match[0] not in ("null", "None"):
             places.append((".".join(map(str, keys)), *match.span()))
     return [] if keys else places
 
@@ -302,6 +321,32 @@ def _is_comment(row: Sequence[str]) -> bool:
 def without_empty_end(row: list[str], count: int) -> list[str]:
     """A row without empty cells beyond so many, as of a delimiter at the end of the line."""
     return row[:count] if len(row) > count and not any(cell.strip() for cell in row[count:]) else row
+
+
+def _suffixes_in(rows: Sequence[Sequence[str]], count: int) -> list[str]:
+    """Return the unit that stands behind the number in each cell of a column, for so many columns; empty where there is
+    none, or not one alone."""
+    found = [set[str]() for _ in range(count)]
+    for row in rows[:_TELLING]:
+        for units, cell in zip(found, row, strict=False):
+            match = _QUANTITY.fullmatch(cell) if cell else None
+            units |= {match[1] if match and match[1] != "-" and is_unit(match[1]) else ""} if cell else set()
+    return [units.pop() if len(units) == 1 else "" for units in found]
+
+
+def _without(cells: list[str], suffixes: Sequence[str]) -> list[str]:
+    """Return the cells of a row without the units behind their numbers."""
+    if not any(suffixes):
+        return cells
+    padded = itertools.chain(suffixes, itertools.repeat(""))
+    return [cell.removesuffix(suffix).rstrip() for cell, suffix in zip(cells, padded, strict=False)]
+
+
+def _number_in(line: str, span: tuple[int, int], unit: str) -> tuple[int, int]:
+    """Return where the number stands in a cell that has this unit behind it."""
+    start, end = span
+    number, found, _ = line[start:end].rpartition(unit)
+    return (start + number.startswith('"'), start + len(number.rstrip())) if found else span
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:

@@ -210,3 +210,37 @@ def test_an_archive_is_to_be_unpacked(run: Any, tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("Raw Data.csv", text(*LAYOUTS["plain JSON"]))
     assert "unpack it" in run.refused("info", path)
+
+
+@pytest.mark.parametrize(
+    ("line", "rate_hz"),
+    [
+        ("// Sample rate: 50.0Hz", 50.0), ("Abtastrate = 12,5 Hz", 12.5), ("Sampling Frequency: 100 Hz", 100.0),
+        ("date format M/d/yyyy at 50 Hz  Filter Normal", 50.0), ("low-pass at 20 Hz", None), ("cut-off 20 Hz", None),
+        ("sample rate 50 Hz, output rate 10 Hz", None), ("rate 50", None),
+    ],
+)  # fmt: skip
+def test_the_rate_of_rows_without_a_time_is_that_stated_above_them(
+    line: str, rate_hz: float | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([line, "ax_mps2,ay_mps2,az_mps2", *(",".join(map(str, f)) for f in FORCES.tolist()), ""]))
+    source = Lines(path, {"gravity_mps2": "9.80665"}, angles=False)
+    if rate_hz is None:
+        with pytest.raises(InputError, match="no column gives the time"):
+            next(iter(source))
+        return
+    times_ns = np.concatenate([batch.accel.time_ns for batch in source])
+    np.testing.assert_allclose(np.diff(times_ns), 1e9 / rate_hz, atol=1.0)
+    assert any(f"{rate_hz:g} of them a second, as is stated above them" in said for said in source.warnings)
+
+
+def test_a_cell_in_another_unit_than_its_column_is_no_number(tmp_path: Path) -> None:
+    rows = [f'{STEP_S * k:.2f},"{x} m/s²","{y} m/s²","{z} m/s²"' for k, (x, y, z) in enumerate(FORCES.tolist())]
+    rows[400:410] = [row.replace("m/s²", "mm/s²") for row in rows[400:410]]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t,ax,ay,az", *rows, ""]))
+    source = Lines(path, {"gravity_mps2": "9.80665"}, angles=False)
+    kept = np.concatenate([batch.accel.values for batch in source])
+    np.testing.assert_allclose(kept, np.delete(FORCES, range(400, 410), axis=0))
+    assert any("10 of 721 lines were malformed and skipped" in said for said in source.warnings)
