@@ -141,6 +141,7 @@ def test_without_its_source_a_slow_oscillation_is_fitted_by_one_pass_and_that_is
     assert "second pass" not in whole.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency_hz", [0.1, *slow(0.01, 0.3, 1.5)])
 def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> None:
     """Too slow or too weak for a line in the spectrum: three cycles a run, one and two cycles a dwell, ten."""
@@ -479,6 +480,7 @@ def test_what_comes_back_is_described_as_such() -> None:
     assert said is not None and said.driver == RETURNING and said.formula == "bias-walk", found.verdict
 
 
+@pytest.mark.slow
 def test_a_walk_that_may_come_back_is_said_to() -> None:
     """Telegraph noise that is not unlikely enough for a walk to be none."""
     found = diagnose(source("telegraph=15sigma;tau=30", seed=17, dwells=24))

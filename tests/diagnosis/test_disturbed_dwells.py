@@ -64,6 +64,7 @@ def test_the_noise_of_the_others_is_as_without_it(course: str) -> None:
     np.testing.assert_allclose(noise.sigma_mps2, WHITE_MPS2, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_run_has_one_p_where_its_readings_change_within_a_dwell() -> None:
     """The means agree with p = 0.01 by their misfit: replay said so beside a diagnosis of p < 1e-300."""
     run = calibrate(disturbed("swing of 11 s", 3e-4, 3))
@@ -226,6 +227,7 @@ class Mistyped(SmallRun):
             yield replace(batch, pose=Stream(batch.pose.time_ns, poses))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [False, *slow(True)])
 @pytest.mark.parametrize("turned_deg", [10.0, *slow(0.3, 0.01)])
 @pytest.mark.parametrize("beside", [False, *slow(True)])

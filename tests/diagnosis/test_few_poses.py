@@ -45,6 +45,7 @@ def test_noise_of_few_poses_is_no_effect(seed: int, faces: bool, stated: bool) -
         assert found.missing == () and found.test.consistent is not False, found.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
 def test_six_faces_do_not_tell_what_is_the_same_there(seed: int, stated: bool) -> None:

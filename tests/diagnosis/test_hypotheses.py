@@ -177,6 +177,7 @@ def test_noise_that_nobody_stated_is_told_as_noise() -> None:
 NOT_STATED: dict[str, float | None] = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "states", "least", "most"),
     [

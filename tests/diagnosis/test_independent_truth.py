@@ -39,6 +39,7 @@ def after(state: State, dwell: int) -> np.ndarray:
     return np.where(state.dwell >= dwell, 1.0, 0.0)[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gimbal, seed", [(1, 1), *slow((2, 2), (2, 3))])
 def test_play_of_a_gimbal_is_no_error_of_its_encoder(gimbal: int, seed: int) -> None:
     """In a random order the sense of the last move goes with the angle, as an encoder's scale would."""
@@ -192,6 +193,7 @@ def test_a_formula_that_no_sensor_could_follow_describes_nothing() -> None:
         assert "sin(q2)" not in formula
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "time_constant_s, seeds", [(14.0, range(1, 2)), *slow(*((tau, range(1, 4)) for tau in (8.0, 14.0, 28.0)))]
 )
@@ -290,6 +292,7 @@ def test_a_gimbal_that_alone_does_not_repeat_is_told_and_nothing_else_is(
         assert drivers < 0.5, diagnosis.table
 
 
+@pytest.mark.slow
 def test_constants_of_two_effects_are_those_beside_each_other() -> None:
     """A bias and a scale factor of one sensor warm up: alone, each of the two time constants is another."""
 

@@ -124,6 +124,7 @@ def test_the_unknown_stops_it() -> None:
     assert state.because == "unknown" and not state.steps and "Unknown" in state.reason
 
 
+@pytest.mark.slow
 def test_equal_explanations_are_left_to_a_person() -> None:
     before = diagnosed("second-order=6sigma").before
     state = known_runs.improved("second-order=6sigma")
@@ -153,6 +154,7 @@ def test_removals_are_the_rise_of_chi_squared(improved: Improvement) -> None:
         assert test.name == name and test.dof == 3 and test.statistic == pytest.approx(rises, rel=0.02, abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) -> None:
     """A step that explained nothing is taken out when the true effect comes in; the user's own stays."""
     useless, start = Refits().of(improved.start.before, ("hysteresis",)), Improvement(improved.start)

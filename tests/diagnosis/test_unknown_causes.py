@@ -173,6 +173,7 @@ def shares(diagnosis: Diagnosis) -> tuple[float, float]:
     return noise, sum(row.probability for row in unknown)
 
 
+@pytest.mark.slow
 def test_without_a_repeated_orientation_scatter_and_an_unknown_cause_cannot_be_told_apart() -> None:
     diagnosis = scattered(0, False)
     noise, irregular = shares(diagnosis)

@@ -33,6 +33,7 @@ def held(dwells: int, runs: int, seed: int, **noise: float) -> tuple[float, floa
     return tuple(inside / (12 * runs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dwells", [8, *slow(6, 12, 24)])
 @pytest.mark.parametrize("noise", [{"setting_deg": float(np.degrees(OF_A_MEAN / 9.81))}, *slow(
     {}, {"scatter_mps2": 0.8 * OF_A_MEAN}, {"scatter_mps2": 3.0 * OF_A_MEAN})])  # fmt: skip

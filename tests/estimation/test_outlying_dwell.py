@@ -19,6 +19,7 @@ LARGEST_OR_LEAST = [(options, *ERRORS[1 if k % 2 else 3]) for k, options in enum
 OTHERS = [case for options in OPTIONS for error in ERRORS if (case := (options, *error)) not in LARGEST_OR_LEAST]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "number", "gimbal", "error_deg"),
     [LARGEST_OR_LEAST[0], *slow(*LARGEST_OR_LEAST[1:], *OTHERS)],

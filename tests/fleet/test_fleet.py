@@ -37,6 +37,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("campaign"), runs=4, units=2, dwells=6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("at_once")
 def test_each_run_has_the_numbers_that_it_has_alone(campaign: Path, run: Any, tmp_path: Path) -> None:
     bad = tmp_path / "bad.mcap"
