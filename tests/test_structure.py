@@ -219,8 +219,8 @@ logs in layouts that their loggers chose, and for objects of many lines. Those o
 were raised for biases that walk by another amount each, and intervals that allow for it. Those of bench, support and
 dwells were raised for numbers that several rooms had each for itself: of rounding, memory, searches and levels, and for
 the names of the state. Several rose by some lines for names of the field, which are longer; that of diagnosis for noise
-of one gimbal, and for pairs that share decompositions and keep less in memory, and once more for a jackknife over slews;
-that of sources for units in cells and a rate above the names."""
+of one gimbal, for pairs that share decompositions and keep less in memory, and for a jackknife over slews; that of
+sources for units in cells and a rate above the names."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 
