@@ -35,13 +35,13 @@ taken for and the command to try. Where readings are counts, that command has th
 With the angles of a platform in the same file all twelve parameters are estimated: see [a CSV file](own_csv.md) and
 [a bag](bags.md).
 
-Files of MATLAB, HDF5 and NumPy, flight logs and bags of ROS 1 are read by libraries that come with `pip install
-'kf_calib[logs]'` (MATLAB up to version 7 and NumPy need nothing). All arrays of a file that have the same length are
-taken together, whatever their groups; a number called `fs` or `dt` gives the time where no array does, and an
-attribute `units` the unit. Where a file holds several accelerometers, or sensors at several rates, the dataset with
-the most readings is taken and the others are named; `--accel-topic` chooses: `--accel-topic sensor_accel.1`. What
-lies outside of the file, and objects whose reading could run code, are not followed. Such a file is read whole into
-memory, so it may have up to 1 GB; text, MCAP and bags may have any size.
+Files of MATLAB, HDF5, NumPy and LabVIEW (`.tdms`), tables in Parquet and Arrow, flight logs and bags of ROS 1 are read
+by libraries that come with `pip install 'kf_calib[logs]'` (MATLAB up to version 7 and NumPy need nothing). All arrays
+of a file that have the same length are taken together, whatever their groups; a number called `fs` or `dt` gives the
+time where no array does, and an attribute `units` the unit. Where a file holds several accelerometers, or sensors at
+several rates, the dataset with the most readings is taken and the others are named; `--accel-topic` chooses:
+`--accel-topic sensor_accel.1`. What lies outside of the file, and objects whose reading could run code, are not
+followed. Such a file is read whole into memory, so it may have up to 1 GB; text, MCAP and bags may have any size.
 """
 
 

@@ -30,11 +30,11 @@ _LOST = 1e-3  # share of what all dwells determine of the model, below which som
 class Spanned:
     """Rows of all dwells, whitened by what was stated: basis (D, 3, k) of what the model spans, columns (D, 3, C) and
     readings (D, 3) off it; the same of rows that are the same in all noise, (r, k), (r, C) and (r,). log: of the
-    density, with the model integrated out, but for chi-squared. Columns have seven digits, as they are most of the
-    memory; their products have sixteen."""
+    density, with the model integrated out, but for chi-squared. Columns have seven digits where that is enough, as
+    they are most of the memory; their products have sixteen."""
 
     basis: Floats
-    columns: Singles
+    columns: Floats | Singles
     readings: Floats
     more_basis: Floats
     more_columns: Floats

@@ -38,6 +38,7 @@ _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
 _FACTORS = 8  # of which a product is a double, whatever the sizes
 
+_EXACT = 0.01  # to which log likelihoods are known
 _NONE = np.zeros(0)
 
 Combination = tuple[slice, Floats | None]
@@ -118,7 +119,7 @@ class RunLikelihood:
 
     def _made(
         self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination], z: Floats, basis: Floats
-    ) -> tuple[Singles, WithinRows]:
+    ) -> tuple[Floats | Singles, WithinRows]:
         """Return the columns (D, 3, C) of all terms in the means, and rows within dwells, made for a few dwells at a
         time: their values at all nodes take ten times the memory. z (D, 3): what the model leaves of the means; basis
         (3 D, r): what it spans."""
@@ -127,7 +128,10 @@ class RunLikelihood:
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
-        columns = np.empty((len(dwells), 3, count), np.float32)
+        # the log of a Bayes factor errs by as much as rounding changes chi-squared
+        is_rough = float(np.sum(z**2)) * np.finfo(np.float32).eps < _EXACT
+        shape = len(dwells), 3, count
+        columns: Floats | Singles = np.empty(shape, np.float32) if is_rough else np.empty(shape)
         # chi-squared of the means beyond its expectation, and no less than noise makes of it
         explained = max(float(np.sum(z**2)) - z.size, 0.0) + 3.0 * math.sqrt(2.0 * z.size)
         within = WithinRows(self.noise, linearised, known, np.append(state, np.zeros(made)), explained)
@@ -236,7 +240,7 @@ class RunLikelihood:
         return (self._root @ made)[..., 0]
 
 
-def _squares(columns: Singles) -> Floats:
+def _squares(columns: Floats | Singles) -> Floats:
     """Return the squares (C,) of columns (D, 3, C)."""
     return np.asarray(np.einsum("dic,dic->c", columns, columns, dtype=np.float64))
 
@@ -264,7 +268,7 @@ def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats | 
 
 
 def _off(
-    model: Floats, columns: Singles, z: Floats, more_model: Floats, more_columns: Floats, more_z: Floats
+    model: Floats, columns: Floats | Singles, z: Floats, more_model: Floats, more_columns: Floats, more_z: Floats
 ) -> Spanned:
     """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the columns are
     overwritten."""

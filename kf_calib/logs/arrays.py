@@ -1,7 +1,8 @@
-"""Files of arrays: MATLAB's .mat of versions 4 to 7.3, HDF5, and NumPy's .npy and .npz."""
+"""Files of arrays: MATLAB's .mat of versions 4 to 7.3, HDF5, NumPy's, LabVIEW's .tdms, tables in Parquet and Arrow."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ from kf_calib.sources.text.names import is_unit
 
 if TYPE_CHECKING:
     import h5py
+    import pyarrow
 
 _LARGEST_BYTES = 2 << 30  # of all arrays of a file, unpacked
 _MOST_LEVELS, _MOST_STRUCTS = 16, 1000
@@ -82,7 +84,11 @@ def _read(node: h5py.Dataset) -> ArrayColumn:
 def _unit_of(node: h5py.Dataset) -> str:
     """Return the unit that the attributes of a dataset state; nothing where they state none."""
     value = next((node.attrs[key] for key in ("units", "unit", "Units", "Unit") if key in node.attrs), "")
-    text = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return _unit(value.decode(errors="replace") if isinstance(value, bytes) else value)
+
+
+def _unit(text: object) -> str:
+    """Return a text that is a unit; nothing for any other."""
     return text if isinstance(text, str) and is_unit(text) else ""
 
 
@@ -112,6 +118,57 @@ def numpy_arrays(path: Path) -> ArrayGroup:
         _refuse_large(path, sum(part.file_size for part in loaded.zip.infolist()))
         for name in loaded.files:
             root.put((name,), loaded[name])
+    return root
+
+
+def tdms_arrays(path: Path) -> ArrayGroup:
+    """The channels of a TDMS file of LabVIEW, by their groups, with the step of their waveforms."""
+    from nptdms import TdmsFile
+    from nptdms.log import log_manager
+
+    log_manager.set_level(logging.ERROR)  # that a file ends early is seen by what it holds
+    root = ArrayGroup()
+    with path.open("rb") as opened, TdmsFile.open(opened) as file:  # which leaves its own open where it is damaged
+        groups = file.groups()
+        _refuse_large(path, sum(8 * len(channel) for group in groups for channel in group.channels()))
+        for group in groups:
+            for channel in group.channels():
+                stated = channel.properties
+                root.put((group.name, channel.name), channel[:], _unit(stated.get("unit_string")))
+                if step_s := stated.get("wf_increment"):
+                    root.put((group.name, "dt"), step_s)
+    return root
+
+
+def parquet_arrays(path: Path) -> ArrayGroup:
+    """The columns of a table in a Parquet file."""
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        groups = range(file.metadata.num_row_groups)
+        _refuse_large(path, sum(file.metadata.row_group(k).total_byte_size for k in groups))
+        return _of_table(file.read())
+
+
+def arrow_arrays(path: Path) -> ArrayGroup:
+    """The columns of a table in a file of Arrow, which Feather is, too."""
+    from pyarrow import feather
+
+    return _of_table(feather.read_table(path))
+
+
+def _of_table(table: pyarrow.Table) -> ArrayGroup:
+    """Return the columns of a table; the parts of a struct are columns, and vectors of one length an array."""
+    from pyarrow import types
+
+    root = ArrayGroup()
+    while any(types.is_struct(each.type) for each in table.schema):
+        table = table.flatten()
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        is_text = types.is_string(column.type) or types.is_large_string(column.type)
+        is_vector = types.is_list(column.type) or types.is_fixed_size_list(column.type)
+        values = np.array(column.to_pylist()) if is_vector or is_text else column.to_numpy()
+        root.put(tuple(name.split(".")), values)
     return root
 
 

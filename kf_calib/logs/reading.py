@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kf_calib.errors import need
-from kf_calib.logs.arrays import hdf5_arrays, matlab_arrays, numpy_arrays
+from kf_calib.logs.arrays import arrow_arrays, hdf5_arrays, matlab_arrays, numpy_arrays, parquet_arrays, tdms_arrays
 from kf_calib.logs.flight_logs import dataflash_datasets, ulog_datasets
 from kf_calib.logs.groups import ArrayGroup, datasets_of
 from kf_calib.sources.containers.dataset import Dataset
@@ -16,6 +16,9 @@ _READERS: dict[ContainerKind, tuple[str, Callable[[Path], list[Dataset] | ArrayG
     ContainerKind.MATLAB: ("scipy", matlab_arrays),
     ContainerKind.HDF5: ("h5py", hdf5_arrays),
     ContainerKind.NUMPY: ("numpy", numpy_arrays),
+    ContainerKind.TDMS: ("nptdms", tdms_arrays),
+    ContainerKind.PARQUET: ("pyarrow", parquet_arrays),
+    ContainerKind.ARROW: ("pyarrow", arrow_arrays),
     ContainerKind.ULOG: ("pyulog", ulog_datasets),
     ContainerKind.DATAFLASH: ("pymavlink", dataflash_datasets),
 }

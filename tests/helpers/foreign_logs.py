@@ -7,7 +7,7 @@ import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -319,6 +319,32 @@ def dataflash(path: Path) -> None:
     path.write_bytes(b"".join(parts))
 
 
+def tdms(path: Path) -> None:
+    """Waveforms of LabVIEW: each channel has the step of its stamps."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    channels = {f"Acceleration {axis}": (readings()[:, k] / G, "g") for k, axis in enumerate("XYZ")}
+    channels["Rate X"] = others()[:, 0], "deg/s"
+    with TdmsWriter(path) as writer:
+        writer.write_segment([
+            ChannelObject("IMU", name, values, {"unit_string": unit, "wf_increment": 1.0 / RATE_HZ})
+            for name, (values, unit) in channels.items()
+        ])  # fmt: skip
+
+
+def parquet(path: Path, *, as_arrow: bool) -> None:
+    """Messages as a table, their vectors as structs."""
+    import pyarrow as pa
+    from pyarrow import feather
+    from pyarrow import parquet as files
+
+    vectors = {"linear_acceleration": readings(), "angular_velocity": others()}
+    structs = {name: pa.StructArray.from_arrays(list(map(pa.array, values.T)), list("xyz"))
+               for name, values in vectors.items()}  # fmt: skip
+    table = pa.table({"timestamp": pa.array(list(map(int, stamps_ns())), pa.timestamp("ns", "UTC")), **structs})
+    feather.write_feather(table, path) if as_arrow else files.write_table(table, path)
+
+
 @dataclass(frozen=True)
 class ForeignLog:
     """A file as another program writes it. holds: what is in it, where it is no text. digits: to which size its numbers
@@ -376,6 +402,31 @@ note      'bench 2'""",
 fs     100
 accel  3 x {COUNT}
 gyro   3 x {COUNT}""",
+    ),
+    "TDMS of LabVIEW": ForeignLog(
+        "log.tdms",
+        tdms,
+        f"""\
+IMU/Acceleration X  {COUNT}, unit_string: g, wf_increment: 0.01
+IMU/Acceleration Y  {COUNT}, unit_string: g, wf_increment: 0.01
+IMU/Acceleration Z  {COUNT}, unit_string: g, wf_increment: 0.01
+IMU/Rate X          {COUNT}, unit_string: deg/s, wf_increment: 0.01""",
+    ),
+    "a Parquet table": ForeignLog(
+        "log.parquet",
+        partial(parquet, as_arrow=False),
+        f"""\
+timestamp            {COUNT}
+linear_acceleration  {COUNT}, x, y, z
+angular_velocity     {COUNT}, x, y, z""",
+    ),
+    "a Feather table": ForeignLog(
+        "log.feather",
+        partial(parquet, as_arrow=True),
+        f"""\
+timestamp            {COUNT}
+linear_acceleration  {COUNT}, x, y, z
+angular_velocity     {COUNT}, x, y, z""",
     ),
     "a bag of ROS 1": ForeignLog(
         "log.bag",

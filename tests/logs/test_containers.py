@@ -24,6 +24,7 @@ from kf_calib.sources.text.units import Units
 GRAVITY = {"gravity_mps2": str(G)}
 ARRAYS = {
     "log.mat": ContainerKind.MATLAB, "log.h5": ContainerKind.HDF5, "log.npz": ContainerKind.NUMPY,
+    "log.tdms": ContainerKind.TDMS, "log.parquet": ContainerKind.PARQUET, "log.feather": ContainerKind.ARROW,
     "log.ulg": ContainerKind.ULOG, "log.bin": ContainerKind.DATAFLASH,
 }  # fmt: skip
 LOGS = {log.file: log for log in FOREIGN_LOGS.values() if log.file in ARRAYS}

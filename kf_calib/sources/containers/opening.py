@@ -23,6 +23,9 @@ class ContainerKind(Enum):
     MATLAB = "MATLAB"
     HDF5 = "HDF5"
     NUMPY = "NumPy"
+    TDMS = "TDMS"
+    PARQUET = "Parquet"
+    ARROW = "Arrow"
     ULOG = "ULog"
     DATAFLASH = "DataFlash"
 
@@ -40,6 +43,10 @@ def kind_of_container(path: Path) -> ContainerKind | None:
         return ContainerKind.MATLAB
     if start.startswith(b"\x93NUMPY") or (start.startswith(b"PK") and path.suffix.lower() == ".npz"):
         return ContainerKind.NUMPY
+    if start.startswith(b"TDSm"):
+        return ContainerKind.TDMS
+    if start.startswith((b"PAR1", b"ARROW1")):
+        return ContainerKind.PARQUET if start.startswith(b"PAR1") else ContainerKind.ARROW
     if start.startswith(b"ULog\x01\x12\x35"):
         return ContainerKind.ULOG
     return ContainerKind.DATAFLASH if start.startswith((_DATAFLASH, b"FMT, 128,")) else None
@@ -60,15 +67,15 @@ def datasets_in(path: Path) -> tuple[Dataset, ...]:
 def _read(path: Path, kind: ContainerKind, *state: int) -> tuple[Dataset, ...]:
     """Return the datasets of a file in this state."""
     logs = leaf("logs.reading", f"{path}, a file of {kind.value},")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of libraries, on files that are odd and can be read
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of libraries, on files that are odd and can be read, or that they leave open
+        try:
             return tuple(logs.read_datasets(path, kind))
-    except KfCalibError:
-        raise
-    except Exception as error:  # libraries raise what they like on a damaged file
-        said = " ".join(str(error).split())[:100] or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a file of {kind.value} ({said}): copy it anew.") from None
+        except KfCalibError:
+            raise
+        except Exception as error:  # libraries raise what they like on a damaged file
+            said = " ".join(str(error).split())[:100] or type(error).__name__
+    raise InputError(f"{path}: cannot be read as a file of {kind.value} ({said}): copy it anew.")
 
 
 def dataset_of(path: Path, name: str = "") -> Dataset:
