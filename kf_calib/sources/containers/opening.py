@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import warnings
 from collections.abc import Iterator
 from enum import Enum
@@ -75,6 +76,7 @@ def _read(path: Path, kind: ContainerKind, *state: int) -> tuple[Dataset, ...]:
             raise
         except Exception as error:  # libraries raise what they like on a damaged file
             said = " ".join(str(error).split())[:100] or type(error).__name__
+        gc.collect()  # closes what they left open
     raise InputError(f"{path}: cannot be read as a file of {kind.value} ({said}): copy it anew.")
 
 
