@@ -190,7 +190,7 @@ CEILINGS = {
     "support": 1105,
     "bench": 1714,
     "effects": 3131,
-    "sources": 11954,
+    "sources": 11959,
     "dwells": 3814,
     "noise": 3406,
     "estimation": 7893,

@@ -104,9 +104,11 @@ class TextHeading(NamedTuple):
         behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
         names = tuple(filled[k][0] for k in named)
         suffixes = _suffixes_in([own for _, own in rows], len(header))
-        named = zip(header, suffixes, strict=True)
-        header = [f"{name} [{unit}]" if unit and not meaning_of(name).unit else name for name, unit in named]
-        values = [_without(own, suffixes) for _, own in rows]
+        values = [own for _, own in rows]
+        if suffixes:
+            named = zip(header, suffixes, strict=True)
+            header = [f"{name} [{unit}]" if unit and not meaning_of(name).unit else name for name, unit in named]
+            values = [_without(own, suffixes) for own in values]
         return cls(header, delimiter, behind, values, names, numbers=[k for k, _ in rows], suffixes=suffixes)
 
     @classmethod
@@ -161,6 +163,8 @@ class TextHeading(NamedTuple):
         spans = [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
+        if not self.suffixes:
+            return spans
         padded = itertools.chain(self.suffixes, itertools.repeat(""))
         return [_number_in(line, span, unit) if unit else span for span, unit in zip(spans, padded, strict=False)]
 
@@ -324,19 +328,20 @@ def without_empty_end(row: list[str], count: int) -> list[str]:
 
 
 def _suffixes_in(rows: Sequence[Sequence[str]], count: int) -> list[str]:
-    """Return the unit that stands behind the number in each cell of a column, for so many columns; empty where there is
-    none, or not one alone."""
+    """Return the unit that stands behind the number in each cell of a column, for so many columns; "" where there is
+    none, or not one alone, and nothing at all where no column has one."""
     found = [set[str]() for _ in range(count)]
     for row in rows[:_TELLING]:
         for units, cell in zip(found, row, strict=False):
             match = _QUANTITY.fullmatch(cell) if cell else None
             units |= {match[1] if match and match[1] != "-" and is_unit(match[1]) else ""} if cell else set()
-    return [units.pop() if len(units) == 1 else "" for units in found]
+    units_of = [units.pop() if len(units) == 1 else "" for units in found]
+    return units_of if any(units_of) else []
 
 
 def _without(cells: list[str], suffixes: Sequence[str]) -> list[str]:
     """Return the cells of a row without the units behind their numbers."""
-    if not any(suffixes):
+    if not suffixes:
         return cells
     padded = itertools.chain(suffixes, itertools.repeat(""))
     return [cell.removesuffix(suffix).rstrip() for cell, suffix in zip(cells, padded, strict=False)]
