@@ -190,7 +190,7 @@ CEILINGS = {
     "support": 1105,
     "bench": 1714,
     "effects": 3131,
-    "sources": 11959,
+    "sources": 11956,
     "dwells": 3814,
     "noise": 3406,
     "estimation": 7893,
@@ -205,7 +205,7 @@ CEILINGS = {
     "certificate": 1500,
     "exports": 1146,
     "fleet": 4246,
-    "logs": 425,
+    "logs": 443,
     "positioning": 1959,
     "reproduction": 855,
 }

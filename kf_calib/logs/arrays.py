@@ -136,7 +136,7 @@ def tdms_arrays(path: Path) -> ArrayGroup:
                 stated = channel.properties
                 root.put((group.name, channel.name), channel[:], _unit(stated.get("unit_string")))
                 if step_s := stated.get("wf_increment"):
-                    root.put((group.name, "dt"), step_s)
+                    root.put((group.name, channel.name, "dt"), step_s)
     return root
 
 

@@ -79,12 +79,10 @@ def _datasets(group: ArrayGroup, place: str, shared: Mapping[Path, Values]) -> I
             if _has_readings(child):
                 yield from _datasets(child, f"{place}/{name}", {**shared, **beside})
         return
-    numbers = {path[-1]: values.array.item() for path, values in arrays.items()
-               if values.array.size == 1 and values.array.dtype.kind in _NUMBERS}  # fmt: skip
     is_alone = sum(each.has_readings for each in made) == 1
     for each in made:
         named = each if (is_alone and each.has_readings) or len(made) == 1 else _named_by_first(place, each)
-        yield _timed(named, numbers)
+        yield _timed(named, arrays)
 
 
 def _has_readings(group: ArrayGroup) -> bool:
@@ -133,14 +131,34 @@ def _named_by_first(place: str, dataset: Dataset) -> Dataset:
     return replace(dataset, name=f"{place}/{name}")
 
 
-def _timed(dataset: Dataset, numbers: Mapping[str, float]) -> Dataset:
-    """Return a dataset with a column of time where it has none, and a number beside it is called a rate or a step."""
+def _timed(dataset: Dataset, arrays: Mapping[Path, Values]) -> Dataset:
+    """Return a dataset of some of the arrays with a column of time where it has none, and a number is called a rate or
+    a step: the one that stands nearest to its arrays, if they have one alone."""
     if dataset.has_time or not dataset.has_readings:
         return dataset
-    for name, value in numbers.items():
-        if name.lower() in _RATES | _STEPS and np.isfinite(value) and value > 0.0:
-            rate = value if name.lower() in _RATES else 1.0 / value
-            said = f"time of {dataset.name} from {rate:g} rows a second, as {name!r} states"
-            columns = {"time_s": np.arange(len(dataset)) / rate, **dataset.columns}
-            return replace(dataset, columns=columns, said=(said,), is_log=True)
-    return dataset
+    places = [path for path, values in arrays.items() if _length(values.array) == len(dataset)]
+    rates = _nearest(_rates_in(arrays), places)
+    if len({rate for _, rate in rates}) != 1:
+        return dataset
+    name, rate = rates[0]
+    said = f"time of {dataset.name} from {rate:g} rows a second, as {name!r} states"
+    columns = {"time_s": np.arange(len(dataset)) / rate, **dataset.columns}
+    return replace(dataset, columns=columns, said=(said,), is_log=True)
+
+
+def _rates_in(arrays: Mapping[Path, Values]) -> dict[Path, tuple[str, float]]:
+    """Return the first number of each group that is called a rate or a step, by the group: its name, and the rate."""
+    rates = dict[Path, tuple[str, float]]()
+    for (*group, name), (array, _) in arrays.items():
+        if array.size == 1 and array.dtype.kind in _NUMBERS and name.lower() in _RATES | _STEPS:
+            value = float(array.item())
+            if np.isfinite(value) and value > 0.0:
+                rates.setdefault(tuple(group), (name, value if name.lower() in _RATES else 1.0 / value))
+    return rates
+
+
+def _nearest(rates: Mapping[Path, tuple[str, float]], places: Sequence[Path]) -> list[tuple[str, float]]:
+    """Return of each array the rate that is stated for it alone, or for the smallest group that it is in; all of them
+    where no array is in such a group."""
+    groups = [[place[:count] for count in range(len(place), -1, -1) if place[:count] in rates] for place in places]
+    return [rates[own[0]] for own in groups if own] or [*rates.values()]

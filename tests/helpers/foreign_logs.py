@@ -364,6 +364,10 @@ def _texts_of(columns: Callable[[], Columns]) -> Callable[[Path], Any]:
     return lambda path: path.write_text(comma_table(columns()), encoding="utf-8")
 
 
+_MESSAGES = f"""\
+timestamp            {COUNT}
+linear_acceleration  {COUNT}, x, y, z
+angular_velocity     {COUNT}, x, y, z"""
 FOREIGN_LOGS: Mapping[str, ForeignLog] = {
     **{name: ForeignLog("log.csv", _texts_of(columns)) for name, columns in COMMA_TABLES.items()},
     "a German Excel": ForeignLog("log.csv", lambda path: path.write_text(german_table(), encoding="cp1252")),
@@ -412,22 +416,8 @@ IMU/Acceleration Y  {COUNT}, unit_string: g, wf_increment: 0.01
 IMU/Acceleration Z  {COUNT}, unit_string: g, wf_increment: 0.01
 IMU/Rate X          {COUNT}, unit_string: deg/s, wf_increment: 0.01""",
     ),
-    "a Parquet table": ForeignLog(
-        "log.parquet",
-        partial(parquet, as_arrow=False),
-        f"""\
-timestamp            {COUNT}
-linear_acceleration  {COUNT}, x, y, z
-angular_velocity     {COUNT}, x, y, z""",
-    ),
-    "a Feather table": ForeignLog(
-        "log.feather",
-        partial(parquet, as_arrow=True),
-        f"""\
-timestamp            {COUNT}
-linear_acceleration  {COUNT}, x, y, z
-angular_velocity     {COUNT}, x, y, z""",
-    ),
+    "a Parquet table": ForeignLog("log.parquet", partial(parquet, as_arrow=False), _MESSAGES),
+    "a Feather table": ForeignLog("log.feather", partial(parquet, as_arrow=True), _MESSAGES),
     "a bag of ROS 1": ForeignLog(
         "log.bag",
         ros1_bag,

@@ -11,6 +11,7 @@ import pytest
 from helpers.bounded import bounded
 from helpers.foreign_logs import FOREIGN_LOGS, RATE_HZ, SECONDS, UP, B, G, K, dataflash, others, readings, ulog
 from helpers.long_runs import slow
+from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from kf_calib import errors
@@ -274,3 +275,42 @@ def test_gyroscopes_are_those_of_the_dataset_that_is_chosen(tmp_path: Path, run:
         channel = next(each for each in channels if each["unit"] == "rad/s")
         white.append(channel["intervals"]["white"]["value"])
     assert white[1] == pytest.approx(3.0 * white[0])
+
+
+def tdms_at_two_rates(path: Path) -> None:
+    waves = [("IMU", f"Acceleration {axis}", readings()[:, k], 1.0 / RATE_HZ) for k, axis in enumerate("XYZ")]
+    others_of_1_hz = [(group, "Temperature", np.full(40, 21.5), 1.0) for group in ("IMU", "Room")]
+    with TdmsWriter(path) as writer:
+        writer.write_segment([
+            ChannelObject(group, name, values, {"wf_increment": step_s})
+            for group, name, values, step_s in [*waves, *others_of_1_hz]
+        ])  # fmt: skip
+
+
+def hdf5_at_two_rates(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["imu/acc"], file["imu/fs"], file["mag/field"], file["mag/fs"] = readings(), RATE_HZ, others()[::10], 10.0
+
+
+def hdf5_at_a_rate_beside(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["imu/acc"], file["about/fs"] = readings(), RATE_HZ
+
+
+@pytest.mark.parametrize(
+    ("file", "write"),
+    [("a.tdms", tdms_at_two_rates), ("a.h5", hdf5_at_two_rates), ("a.h5", hdf5_at_a_rate_beside)],
+)
+def test_readings_have_the_rate_that_stands_nearest_to_them(
+    file: str, write: Callable[[Path], None], tmp_path: Path
+) -> None:
+    """The last rate of the file was that of all: readings at 100 Hz had 1 Hz or 10 Hz."""
+    write(tmp_path / file)
+    np.testing.assert_allclose(read(tmp_path / file)[0], SECONDS, atol=1e-9)
+
+
+def test_two_rates_that_stand_as_near_give_no_time(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["imu/acc"], file["one/fs"], file["two/fs"] = readings(), RATE_HZ, 10.0
+    with pytest.raises(InputError, match="no column gives the time"):
+        read(tmp_path / "a.h5")

@@ -186,23 +186,20 @@ class Columns:
     def time(self) -> Stamps:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
         if self.units.rate_hz is not None:
-            self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
-            return Stamps((), (), rate_hz=self.units.rate_hz)
+            return self._at_rate(self.units.rate_hz, " (--rate)")
         filled = [at for at in self.places("time") if any(row[at].lower() not in NOTHING for row in self.rows)]
         places = filled if self.rows else self.places("time")
-        if not places and self.heading.rate_hz is not None:
-            return self._at_stated_rate()
+        exact = [at for at in places if names.is_exact(self.names[at])]
+        ways = [way for at in exact or places if (way := self._stamps_in(at, places))]
+        if parts := self._parts_of_time(ways):
+            ways.append(parts)
+        if not (ways or self.is_table) and self.heading.rate_hz is not None:  # rows of a table are not readings
+            return self._at_rate(self.heading.rate_hz, ", as is stated above them")
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
                 f"--rate 100; {WANTED}, not {self._all}."
             )
-        exact = [at for at in places if names.is_exact(self.names[at])]
-        ways = [way for at in exact or places if (way := self._stamps_in(at, places))]
-        if parts := self._parts_of_time(ways):
-            ways.append(parts)
-        if not ways and self.heading.rate_hz is not None:
-            return self._at_stated_rate()
         if not ways:
             raise self._without_time(places[0])
         stamps = min(ways, key=self._unevenness) if len(ways) > 1 else ways[0]
@@ -213,10 +210,9 @@ class Columns:
             self.said.append(f"time from {self.named(stamps.at)}{unit}{zone}")
         return stamps
 
-    def _at_stated_rate(self) -> Stamps:
-        """Return the time by the rate of the rows that is stated above their names."""
-        rate_hz = self.heading.rate_hz
-        self.said.append(f"time from the numbers of the rows, {rate_hz:g} of them a second, as is stated above them")
+    def _at_rate(self, rate_hz: float, how: str) -> Stamps:
+        """Return the time by the rate of the rows; how: in words, it is known."""
+        self.said.append(f"time from the numbers of the rows, {rate_hz:g} of them a second{how}")
         return Stamps((), (), rate_hz=rate_hz)
 
     def _stamps_in(self, place: int, places: Sequence[int]) -> Stamps | None:

@@ -9,10 +9,12 @@ import csv
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from kf_calib.sources.text.cells import are_stamps
 from kf_calib.sources.text.names import READINGS, face_of, is_unit, meaning_of, meanings_of, nameless
+
+T = TypeVar("T")
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -163,10 +165,7 @@ class TextHeading(NamedTuple):
         spans = [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
-        if not self.suffixes:
-            return spans
-        padded = itertools.chain(self.suffixes, itertools.repeat(""))
-        return [_number_in(line, span, unit) if unit else span for span, unit in zip(spans, padded, strict=False)]
+        return [_number_in(line, *own) for own in _beside(spans, self.suffixes)] if self.suffixes else spans
 
 
 def scalars(line: str) -> list[tuple[str, int, int]]:
@@ -341,17 +340,19 @@ def _suffixes_in(rows: Sequence[Sequence[str]], count: int) -> list[str]:
 
 def _without(cells: list[str], suffixes: Sequence[str]) -> list[str]:
     """Return the cells of a row without the units behind their numbers."""
-    if not suffixes:
-        return cells
-    padded = itertools.chain(suffixes, itertools.repeat(""))
-    return [cell.removesuffix(suffix).rstrip() for cell, suffix in zip(cells, padded, strict=False)]
+    return [cell.removesuffix(unit).rstrip() for cell, unit in _beside(cells, suffixes)] if suffixes else cells
+
+
+def _beside(cells: Sequence[T], suffixes: Sequence[str]) -> Iterator[tuple[T, str]]:
+    """Yield what stands for each cell of a row with the unit of its column; a row may have more cells than columns."""
+    return zip(cells, itertools.chain(suffixes, itertools.repeat("")), strict=False)
 
 
 def _number_in(line: str, span: tuple[int, int], unit: str) -> tuple[int, int]:
     """Return where the number stands in a cell that has this unit behind it."""
     start, end = span
-    number, found, _ = line[start:end].rpartition(unit)
-    return (start + number.startswith('"'), start + len(number.rstrip())) if found else span
+    number, behind, _ = line[start:end].rpartition(unit) if unit else ("", "", "")
+    return (start + number.startswith('"'), start + len(number.rstrip())) if behind else span
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
