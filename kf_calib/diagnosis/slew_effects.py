@@ -35,7 +35,8 @@ def of_slews(refits: Refits, before: Calibration) -> tuple[HypothesisTable, floa
         return None
     if not together.linearised.slews:
         return None
-    p_values = {name: _p_value(together.fit, name, len(names)) for name in names}
+    jackknife = _Jackknife(together.fit)
+    p_values = {name: sidak(jackknife.p_value(name), len(names)) for name in names}
     missing = tuple(sorted((name for name in names if p_values[name] < CLEAR), key=lambda name: p_values[name]))
     if not missing:
         return None
@@ -46,49 +47,57 @@ def of_slews(refits: Refits, before: Calibration) -> tuple[HypothesisTable, floa
     return table_of([row, Hypothesis(families=(NOTHING,), log_evidence=-log_odds_of(p_value))]), p_value
 
 
-def _p_value(fit: Fit, name: str, effects: int) -> float:
-    """Return the p-value of an effect, of so many that are tried, by how its k coefficients x scatter between slews.
+class _Jackknife:
+    """A fit with its slews, and the same without each of g groups of them in turn, its states in similar units.
 
-      F = (x' C^-1 x / k) / phi,  phi = (g - 1) / g  sum_s d_s' C^-1 d_s / k,  d_s = x - x without the slews s
-
-    C is the covariance of x if noise were white. In motion it is not, and angles are less true; but slews are
-    independent, so that leaving out each of g groups of them in turn (the jackknife) shows the noise as it is. The
-    degrees of freedom of phi are (tr G)^2 / tr G^2, G the covariance of all d_s in white noise (R. Bell, D. McCaffrey,
-    2002): what rests on one slew has hardly more than k.
+    The covariance that the rows tell holds if noise were white. In motion it is not, and angles are less true; but
+    slews are independent of each other, so that the changes d_s without the slews s show the noise as it is.
     """
-    slews = [rows for rows in fit.following if len(rows)]
-    if len(slews) < 2:
-        return 1.0
-    groups = [np.concatenate(slews[part]) for part in portions(len(slews), -(-len(slews) // _GROUPS))]
-    part = fit.linearised.model.parts[name]
-    factor = square_root_information.accumulate(fit.all_rows(), fit.steps)[:-1]
-    size = np.linalg.norm(factor[:, :-1], axis=0)
-    scale = 1.0 / np.append(np.where(size > 0.0, size, 1.0), 1.0)
-    whole, grouped = _squared(factor * scale), np.array([_squared(rows * scale) for rows in groups])
-    covariance = np.linalg.pinv(whole[:-1, :-1], hermitian=True)
-    # what no other slew determines is 0 without it, and so off by all that it is
-    without = np.linalg.pinv(whole[:-1, :-1] - grouped[:, :-1, :-1], rcond=ROUNDING, hermitian=True)
-    state = covariance @ whole[:-1, -1]
-    off = state - np.einsum("spq,sq->sp", without, whole[:-1, -1] - grouped[:, :-1, -1])
-    whitened = np.linalg.inv(np.linalg.cholesky(covariance[part, part]))
-    ratio = float(np.sum((whitened @ state[part]) ** 2) / np.sum((off[:, part] @ whitened.T) ** 2))
-    seen = np.asarray(whitened @ without[:, part], np.float64)
-    spread = _covariance_of_changes(whole[:-1, :-1], grouped[:, :-1, :-1], seen)
-    freedom = float(np.trace(spread) ** 2 / np.sum(spread**2))
-    return sidak(f_tail(len(whitened), freedom, ratio * len(groups) / (len(groups) - 1.0)), effects)
 
+    def __init__(self, fit: Fit) -> None:
+        slews = [rows for rows in fit.following if len(rows)]
+        groups = [np.concatenate(slews[part]) for part in portions(len(slews), -(-len(slews) // _GROUPS) or 1)]
+        self._count, self._parts = len(groups), fit.linearised.model.parts
+        factor = square_root_information.accumulate(fit.all_rows(), fit.steps)[:-1]
+        scale = np.append(square_root_information.scale_columns(factor)[1], 1.0)
+        whole, left_out = _squared(factor / scale), np.array([_squared(rows / scale) for rows in groups])
+        self._information, self._left_out = whole[:-1, :-1], left_out[..., :-1, :-1]
+        self._covariance = np.linalg.pinv(self._information, hermitian=True)
+        # what no other slew determines is 0 without it, and so changes by all that it is
+        self._without = np.linalg.pinv(self._information - self._left_out, rcond=ROUNDING, hermitian=True)
+        self._state = self._covariance @ whole[:-1, -1]
+        along = whole[:-1, -1] - left_out[..., :-1, -1]
+        self._changes = self._state - np.einsum("spq,sq->sp", self._without, along)
 
-def _covariance_of_changes(whole: Floats, grouped: Floats, seen: Floats) -> Floats:
-    """Return the covariance G (g k, g k) of the changes L^-1 d_s in white noise; ``seen`` (g, k, p) is L^-1 P_s.
+    def p_value(self, name: str) -> float:
+        """The p-value of the k coefficients x of an effect, of covariance C in white noise.
 
-    cov(d_s, d_t) = P_s (S - S_s - S_t) P_t - P,  and P_s - P for s = t,  P = S^-1 = L L',  P_s = (S - S_s)^-1
-    """
-    groups, count = seen.shape[:2]
-    of_groups = seen @ grouped
-    spread = np.einsum("sip,tjp->sitj", seen @ whole - of_groups, seen) - np.einsum("sip,tjp->sitj", seen, of_groups)
-    each = np.arange(groups)
-    spread[each, :, each] += of_groups @ np.swapaxes(seen, 1, 2)
-    return (spread - np.eye(count)[:, None, :]).reshape(groups * count, groups * count)
+          F = (x' C^-1 x / k) / phi,  phi = (g - 1) / g  sum_s d_s' C^-1 d_s / k
+
+        The degrees of freedom of phi are (tr G)^2 / tr G^2, G the covariance of all d_s in white noise (R. Bell, D.
+        McCaffrey, 2002): what rests on one slew has hardly more than k.
+        """
+        if self._count < 2:
+            return 1.0
+        part = self._parts[name]
+        root = np.asarray(np.linalg.inv(np.linalg.cholesky(self._covariance[part, part])), np.float64)
+        ratio = np.sum((root @ self._state[part]) ** 2) / np.sum((self._changes[:, part] @ root.T) ** 2)
+        spread = self._covariance_of_changes(root, part)
+        freedom = float(np.trace(spread) ** 2 / np.sum(spread**2))
+        return f_tail(len(root), freedom, float(ratio) * self._count / (self._count - 1.0))
+
+    def _covariance_of_changes(self, root: Floats, part: slice) -> Floats:
+        """Return the covariance G (g k, g k) of the changes L^-1 d_s of a part of the state, ``root`` is L^-1.
+
+        cov(d_s, d_t) = P_s (S - S_s - S_t) P_t - P,  and P_s - P for s = t,  P = S^-1,  P_s = (S - S_s)^-1
+        """
+        seen = np.asarray(root @ self._without[:, part], np.float64)  # (g, k, p)
+        of_groups = seen @ self._left_out
+        spread = np.einsum("sip,tjp->sitj", seen @ self._information - of_groups, seen)
+        spread -= np.einsum("sip,tjp->sitj", seen, of_groups)
+        numbers = np.arange(self._count)
+        spread[numbers, :, numbers] += of_groups @ np.swapaxes(seen, 1, 2)
+        return (spread - np.eye(len(root))[:, None, :]).reshape(self._count * len(root), -1)
 
 
 def _squared(rows: Floats) -> Floats:

@@ -14,7 +14,7 @@ from helpers.long_runs import slow
 import kf_calib
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.slew_effects import _p_value
+from kf_calib.diagnosis.slew_effects import _Jackknife
 from kf_calib.estimation.fit import Fit
 from kf_calib.sources.simulation.injected import parse
 
@@ -73,17 +73,17 @@ class _Rows:
 
 
 def _p_values(random: np.random.Generator, runs: int, correlated: float, size: float = 0.0) -> Floats:
-    """p-values (runs,) of two coefficients of a ``size`` beside three others, in 12 slews of 30 rows, of which one
+    """p-values (runs,) of two coefficients of a ``size`` beside the twelve, in 12 slews of 30 rows, of which one
     tells five times as much; noise that a slew has in common is a course of the size ``correlated``."""
-    parts = SimpleNamespace(model=SimpleNamespace(parts={"latency": slice(3, 5)}))
-    design = random.standard_normal((12, 30, 5)) * np.where(np.arange(12) == 4, 5.0, 1.0)[:, None, None]
-    course = np.sin(np.linspace(0.0, 3.0, 30)) + design[..., 3]
+    parts = SimpleNamespace(model=SimpleNamespace(parts={"latency": slice(12, 14)}))
+    design = random.standard_normal((12, 30, 14)) * np.where(np.arange(12) == 4, 5.0, 1.0)[:, None, None]
+    course = np.sin(np.linspace(0.0, 3.0, 30)) + design[..., 12]
     found = []
     for _ in range(runs):
         common = correlated * random.standard_normal((12, 1)) * course
         noise = random.standard_normal((12, 30)) + common
-        rows = np.concatenate([design, (noise + size * design[..., 4])[..., None]], axis=2)
-        found.append(_p_value(cast("Fit", _Rows(list(rows), parts)), "latency", 1))
+        rows = np.concatenate([design, (noise + size * design[..., 13])[..., None]], axis=2)
+        found.append(_Jackknife(cast("Fit", _Rows(list(rows), parts))).p_value("latency"))
     return np.array(found)
 
 
@@ -97,9 +97,9 @@ def test_p_values_of_slews_hold_in_noise_that_is_common_to_a_slew(correlated: fl
 
 def test_what_one_slew_alone_shows_is_not_named() -> None:
     random = np.random.default_rng(9)
-    parts = SimpleNamespace(model=SimpleNamespace(parts={"latency": slice(3, 5)}))
-    design = random.standard_normal((12, 30, 5))
-    design[1:, :, 3:] *= 1e-3
-    rows = np.concatenate([design, (100.0 * design[..., 3] + random.standard_normal((12, 30)))[..., None]], axis=2)
-    assert _p_value(cast("Fit", _Rows(list(rows), parts)), "latency", 1) > 1e-4
-    assert _p_value(cast("Fit", _Rows(list(rows[:1]), parts)), "latency", 1) == 1.0
+    parts = SimpleNamespace(model=SimpleNamespace(parts={"latency": slice(12, 14)}))
+    design = random.standard_normal((12, 30, 14))
+    design[1:, :, 12:] *= 1e-3
+    rows = np.concatenate([design, (100.0 * design[..., 12] + random.standard_normal((12, 30)))[..., None]], axis=2)
+    assert _Jackknife(cast("Fit", _Rows(list(rows), parts))).p_value("latency") > 1e-4
+    assert _Jackknife(cast("Fit", _Rows(list(rows[:1]), parts))).p_value("latency") == 1.0
