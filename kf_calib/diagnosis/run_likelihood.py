@@ -20,7 +20,9 @@ from functools import cached_property
 
 import numpy as np
 
+from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import AT_ONCE, Floats, Indices, Singles, portions
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
@@ -28,6 +30,9 @@ from kf_calib.dwells.qr import spanned
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
+from kf_calib.estimation.estimate import HOPELESS
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
@@ -98,16 +103,17 @@ class RunLikelihood:
         self.means, self._root = means, np.linalg.inv(np.linalg.cholesky(lift_rounding(covariances)))
         design = np.concatenate([means.design[..., :known], means.design[..., model.count :]], axis=2)
         readings = means.readings - means.design[..., :known] @ linearised.state[:known]
-        of_prior = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
+        of_shared = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
+        of_prior = np.concatenate([of_shared, _prior_of_twelve(model, of_shared.shape[1])])
         self._states = design.shape[2]
         z = (self._root @ readings[..., None])[..., 0]
         whitened = self._root @ design
         columns, within = self._made(effects, known, blocks, z, spanned(whitened.reshape(z.size, -1).copy())[0])
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
-        combined = np.zeros((len(prior) + len(more), columns.shape[2]))
-        _combine(more, blocks, combined[len(prior) :])
+        combined = np.zeros((len(of_prior) + len(more), columns.shape[2]))
+        _combine(more, blocks, combined[len(of_prior) :])
         self.lengths = np.sqrt(_squares(columns) + np.einsum("rc,rc->c", combined, combined))
-        more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
+        more_z, of_model = np.append(np.zeros(len(of_prior)), more_z), np.concatenate([of_prior, of_model])
         self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
         self.spanned = replace(self.spanned, log=self.spanned.log + log_root + within.log)
@@ -265,6 +271,20 @@ def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats | 
         some = columns[..., part] if matrix is None else columns[..., part] @ matrix
         combined[..., first : first + some.shape[-1]] = some
         first += some.shape[-1]
+
+
+def _prior_of_twelve(model: Model, states: int) -> Floats:
+    """Return rows (12, P) of a prior of the twelve parameters as wide as what counts as not determined, about where
+    they are.
+
+    Without it a direction that the orientations do not show takes a degree of freedom as soon as the fit of an effect
+    is off nominal by so little that its columns are no longer zero.
+    """
+    prior = Prior(HOPELESS["rad"], HOPELESS["1"], HOPELESS["m/s^2"])
+    covariance = prior.covariance(paper_parameters.nominal(model.bench.nominal))
+    rows = np.zeros((STATE_COUNT, states))
+    rows[:, :STATE_COUNT] = np.linalg.inv(np.linalg.cholesky(covariance))
+    return rows
 
 
 def _off(

@@ -77,10 +77,12 @@ class _Jackknife:
         The degrees of freedom of phi are (tr G)^2 / tr G^2, G the covariance of all d_s in white noise (R. Bell, D.
         McCaffrey, 2002): what rests on one slew has hardly more than k.
         """
-        if self._count < 2:
-            return 1.0
         part = self._parts[name]
-        root = np.asarray(np.linalg.inv(np.linalg.cholesky(self._covariance[part, part])), np.float64)
+        values, vectors = np.linalg.eigh(self._covariance[part, part])
+        seen = values > ROUNDING * values.max(initial=0.0)  # combinations that slews do not determine have none
+        if self._count < 2 or not seen.any():
+            return 1.0
+        root = vectors[:, seen].T / np.sqrt(values[seen, None])
         ratio = np.sum((root @ self._state[part]) ** 2) / np.sum((self._changes[:, part] @ root.T) ** 2)
         spread = self._covariance_of_changes(root, part)
         freedom = float(np.trace(spread) ** 2 / np.sum(spread**2))

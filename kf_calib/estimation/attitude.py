@@ -22,7 +22,7 @@ from kf_calib.effects import Effect, RotationEffect, Stimulus
 from kf_calib.estimation.dwell_columns import FARTHEST_RAD, LinearisedDwells, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.noise_model import Noise, lift_rounding
 from kf_calib.noise.rotations import rotation_map, tangents
 from kf_calib.support.searches import MOST_STEPS
 
@@ -119,7 +119,7 @@ def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Fl
     weights = 1.0 / (noise.effective_sigma_mps2**2 / means.counts + noise.scatter_mps2**2)
     weighted = np.swapaxes(columns * weights[:, :, None], 1, 2)
     prior = 0.0 if noise.attitude_unknown else 1.0 / noise.setting_rad**2
-    covariances = np.linalg.inv(weighted @ columns + prior * np.eye(2))
+    covariances = np.linalg.inv(lift_rounding(weighted @ columns + prior * np.eye(2)))
     errors = means.readings - means.design @ state
     modes = covariances @ weighted @ errors[:, :, None]
     return (axes @ modes)[:, :, 0], np.einsum("dii->d", covariances)

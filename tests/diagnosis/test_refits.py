@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from helpers.altered import Altered
 from helpers.by_hand import by_hand
-from helpers.synthetic import Run
+from helpers.hidden_effects import noisy_source
+from helpers.synthetic import Run, plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
@@ -43,6 +44,16 @@ def test_a_run_without_dwells_is_that_which_leaves_them_out(source: Source) -> N
     assert rest is not None and len(rest.fit.dwells) == len(before.fit.dwells) - 2
     for symbol, parameter in alone.parameters.items():
         assert rest.parameters[symbol].value == pytest.approx(parameter.value, abs=1e-3 * (parameter.sigma or 1e-9))
+
+
+def test_a_refit_has_the_dwells_of_its_run_though_some_are_too_short_for_averages() -> None:
+    """A real recording of which three poses last 0.4 s ended in a ValueError, and three dwells less are no evidence."""
+    plan = plan_of(14, dwell_s=8.0, seed=3)
+    source = noisy_source(plan=[replace(visit, dwell_s=0.6 if k == 9 else 8.0) for k, visit in enumerate(plan)])
+    before = calibrate(source)
+    assert len(calibrate(source, effects="vibration-rectification").fit.dwells) < len(before.fit.dwells) == 14
+    refit = Refits(source).with_effects(before, ("vibration-rectification",))
+    assert [*refit.fit.dwells.folded.numbers] == [*before.fit.dwells.folded.numbers]
 
 
 def test_a_disturbed_dwell_in_the_hand_is_told_and_the_others_are_diagnosed() -> None:

@@ -117,15 +117,17 @@ def test_noise_beside_the_model_has_its_restricted_likelihood(posterior: RunPost
     likelihood = posterior._run.likelihood
     noises: NoiseSizes = posterior._sizes
     spanned = likelihood.spanned
-    assert not spanned.more_basis.any()
-    rest = np.linalg.svd(spanned.basis.reshape(36, -1))[0][:, spanned.basis.shape[2] :]
+    used = spanned.more_basis.any(axis=1)
+    assert used.sum() == 12  # the wide prior of the twelve; nothing within dwells
+    basis = np.vstack([spanned.basis.reshape(36, -1), spanned.more_basis[used]])
+    rest = np.linalg.svd(basis)[0][:, basis.shape[1] :]
     found, expected = [], []
     for covariance in noises.covariances[1:12]:
         assert covariance is not None
-        dense = np.eye(36)
+        dense = np.eye(48)
         for k in range(12):
             dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += covariance[k]
-        readings = rest.T @ spanned.readings.ravel()
+        readings = rest.T @ np.append(spanned.readings.ravel(), spanned.more_readings[used])
         expected.append(multivariate_normal(cov=rest.T @ dense @ rest).logpdf(readings))
         found.append(likelihood.projected(covariance, np.arange(3)).log)
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=1e-6)

@@ -70,6 +70,7 @@ def main(
     paths = [path for place in folder or FOLDERS if place.is_dir() for path in sorted(place.iterdir())]
     paths = [path for path in paths if path.name.endswith((".csv.gz", ".csv", ".mcap"))]
     paths = [path for path in paths if not only or path.name.partition(".")[0] in only]
+    paths = [path for path in paths if _is_read(path)]
     outcomes = _read(resume)
     known = {(each["recording"], each["effect"], each["sigmas"], each["seed"]) for each in outcomes}
     many = [path for path in paths if len(_recording(str(path), False).dwells_s) >= FEWEST_POSES]
@@ -90,6 +91,15 @@ def main(
     console = Console(width=180)
     console.print(_unmodified(outcomes), _counted(outcomes, "sigmas"), _counted(outcomes, "recording"))
     console.print(_counted(outcomes, "effect"), _reliability(outcomes))
+
+
+def _is_read(path: Path) -> bool:
+    """Whether a recording can be calibrated without options; the reason is told where it cannot."""
+    try:
+        return len(_recording(str(path), False).dwells_s) > 0
+    except kf_calib.KfCalibError as error:
+        Console(stderr=True, width=180).print(f"{path.name} is left out: {error}", markup=False, highlight=False)
+        return False
 
 
 def _read(path: Path | None) -> list[dict[str, Any]]:

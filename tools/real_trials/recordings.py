@@ -21,6 +21,7 @@ from kf_calib.bench.streams import Batch, Source, with_accel
 GRAVITY_MPS2 = 9.80665
 FEWEST_POSES = 18  # for an injection beside nine parameters
 _STEP = 1e-6  # of the parameters, for differences
+_ARRAY_COUNT_MPS2 = "0.0047884033203125"  # of the boards of the MIMU4444 array, which are recorded in counts
 
 
 @dataclass
@@ -48,9 +49,12 @@ class RealRecording:
 
     @cached_property
     def _source(self) -> Source:
+        keys = {"gravity_mps2": str(GRAVITY_MPS2)}
         if self.path.suffix == ".mcap":
-            return kf_calib.open_recording(self.path, {"gravity_mps2": str(GRAVITY_MPS2)}, angles=False)
-        return kf_calib.open_log(self.path, {"gravity_mps2": str(GRAVITY_MPS2)}, angles=False)
+            return kf_calib.open_recording(self.path, keys, angles=False)
+        if self.name.startswith("array_"):
+            keys["accel_scale"] = _ARRAY_COUNT_MPS2
+        return kf_calib.open_log(self.path, keys, angles=False)
 
     @cached_property
     def batches(self) -> list[Batch]:
