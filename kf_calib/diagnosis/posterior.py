@@ -50,7 +50,7 @@ from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
+from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import CLEAR, LEVEL, chi_squared_tail, log_odds_of
@@ -104,9 +104,7 @@ class RunPosterior:
         rows = [*self._without_terms(), *self._singles(), *self._dwells_apart()]
         if refitted:
             rows = self._fitted(_merged([*rows, *self._pairs()]))
-            beside = self._dwells_beside(rows)
-            rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
-            rows = _with_sure_dwells(rows, beside)
+            rows = _with_sure_dwells(self._with_changes_within(rows), self._dwells_beside(rows))
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         table = replace(table_of(rows), scattering=self._scattering)
         return replace(table, same=self._same_as(table.first)) if refitted else table
@@ -199,8 +197,7 @@ class RunPosterior:
             share = self._share_of_unknown(family)
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
-        within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
-        within = max(within, self._run.likelihood.courses.log_bayes_alike)
+        within = self._run.likelihood.courses.log_bayes_alike
         log_nothing, log_irregular = noises[0][1] + prior, _log_sum(irregular) + within
         if self._test.consistent is False:  # chance, or a cause of which there is no term: at least as p has it
             odds = log_odds_of(self._test.p_value or 0.0) + math.log(PRIOR["unknown"] / PRIOR["nothing"])
@@ -291,8 +288,7 @@ class RunPosterior:
     def _dwells_beside(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows of dwells that are off beside the likeliest effects, and unknown functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
-        known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
-        fitted = [row for row in known if row.refit is not None][:_ALWAYS]
+        fitted = self._likeliest_fitted(rows)
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
         run = self._run.likelihood
@@ -508,17 +504,29 @@ class RunPosterior:
         log += self._log_prior(row.effects) + sum(map(self._log_share_of_constant, row.effects))
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
-    def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the row of irregular changes with those beside a random walk of the biases, for which speaks what this
-        leaves within dwells, as far as an unknown function beside it leaves it."""
-        logs = [irregular.log_evidence]
-        for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
-            left = trend(row.refit.fit) if self._test.trend and row.refit else None
-            within = log_odds_of(left.p_value) if left else -math.inf
-            if (courses := self._courses_beside(row)) is not None:
-                within = min(within, courses.log_bayes_alike)
-            logs.append(row.log_evidence + within + math.log(_WITHIN))
-        return replace(irregular, log_evidence=_log_sum(logs))
+    def _with_changes_within(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return rows with those of irregular changes beside the likeliest effects, for which speaks what these leave
+        within dwells; beside a random walk of the biases all of it is irregular."""
+        beside, walked = list[Hypothesis](), list[float]()
+        for row in self._likeliest_fitted(rows):
+            assert row.refit is not None
+            within = self._where_fitted(row.refit)[1].log_bayes_alike
+            if within > 0.0:
+                log, families = row.log_evidence + within + math.log(_WITHIN), (*row.families, NONE)
+                beside.append(replace(row, driver=IRREGULAR, families=families, log_evidence=log))
+        for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver):
+            k = self._best[self._run.walk]
+            within = self._run.courses_beside(k, self._likeliest_noise(k)).log_bayes_alike
+            walked.append(row.log_evidence + within + math.log(_WITHIN))
+        return [
+            replace(row, log_evidence=_log_sum([row.log_evidence, *walked])) if row.driver == IRREGULAR else row
+            for row in rows
+        ] + beside
+
+    def _likeliest_fitted(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the likeliest rows of effects that were fitted, without a random walk."""
+        known = [row for row in rows if row.effects and not row.driver and self._run.walk not in row.effects]
+        return sorted((row for row in known if row.refit is not None), key=lambda row: -row.log_evidence)[:_ALWAYS]
 
     def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and

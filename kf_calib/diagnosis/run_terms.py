@@ -198,6 +198,7 @@ class RunTerms:
         run_s, count = dwells[-1].end_s, min(max(len(dwells), _FEWEST_WAVES), 2 * len(dwells), _WAVES)
         walks = [_Walk(run_s, most, of_scale) for of_scale in (False, True) for most in (count, min(count, _SMOOTH))]
         of_bias, of_bias_smooth, of_scale, of_scale_smooth = (columns.block(columns.add([walk])) for walk in walks)
+        self._path = walks[0]
         rates, even = walks[0].rates, np.ones(count)
         smooth = rates[0] / walks[1].rates
         taus_s = [run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
@@ -214,20 +215,27 @@ class RunTerms:
             columns.irregular(f"?{len(self.unknown) - 1}", block, scales)
 
     def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
-        """What is left of the courses of the readings within dwells by an unknown function, as a term has it and as it
-        is likeliest in one noise."""
+        """What is left of the courses of the readings within dwells by an unknown function, or a random walk, as a term
+        has it and as it is likeliest in one noise."""
         term, rows = self.terms[k], self.likelihood.projected(covariance, self.terms[k].columns)
-        columns, squares = rows.of(term.columns), term.sizes.values**2
+        scales = np.ones(len(term.columns)) if term.scales is None else term.scales
+        columns, squares = rows.of(term.columns) * scales, term.sizes.values**2
         values, vectors = np.linalg.eigh(columns.T @ columns)
         along = vectors.T @ (columns.T @ rows.readings)
         logs = term.sizes.logs + log_bayes_by_size(along**2, values, 1.0, squares).sum(axis=0)
         shrunk = squares[:, None] / (1.0 + squares[:, None] * values)
         likeliest = vectors @ (along * (softmax(logs) @ shrunk))
-        summands = self.unknown[int(term.row[1:])].summands
-        effects = [self.formula_of(text) for number in term.summands for text in summands[number]]
+        effects = self._effects_of(term)
         coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
-        coefficients[term.only] = likeliest * self.likelihood.scales[term.columns]
+        coefficients[term.only] = likeliest * scales * self.likelihood.scales[term.columns]
         return self.likelihood.courses_at(self._linearised.state, effects, coefficients)
+
+    def _effects_of(self, term: RunTerm) -> list[Effect]:
+        """Return the effects that make the columns of an unknown function, or of a random walk."""
+        if term.row == self.walk:
+            return [self._path]
+        summands = self.unknown[int(term.row[1:])].summands
+        return [self.formula_of(text) for number in term.summands for text in summands[number]]
 
     def of_summands(self, term: RunTerm) -> Iterator[tuple[int, Indices]]:
         """Yield the number of each summand that an unknown function has in a term, with its columns."""

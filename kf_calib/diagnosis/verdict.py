@@ -156,7 +156,8 @@ def _beside(diagnosis: Diagnosis, first: Hypothesis) -> str:
     if not first.driver:
         return ""
     words = [f", or is {names} {share}" for names, share in _known_beside(diagnosis, first)]
-    unknown = f"the rest goes with {first.driver}, as no known effect does ({format_probability(first.probability)})"
+    rest = "changes irregularly" if first.driver == IRREGULAR else f"goes with {first.driver}"
+    unknown = f"the rest {rest}, as no known effect does ({format_probability(first.probability)})"
     return f"; {unknown}{''.join(words)}"
 
 
@@ -304,7 +305,9 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
 def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
-        return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.driver else "")
+        rest = " beside irregular changes within dwells" if row.driver == IRREGULAR else ""
+        beside = rest or (f" beside no known effect, which goes with {row.driver}" if row.driver else "")
+        return f"{_effects_of(row)}{beside}"
     if row.families == (NOTHING,):
         return "nothing missing"
     if row.driver:
