@@ -50,7 +50,7 @@ from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation
+from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import CLEAR, LEVEL, chi_squared_tail, log_odds_of
@@ -514,9 +514,11 @@ class RunPosterior:
             if within > 0.0:
                 log, families = row.log_evidence + within + math.log(_WITHIN), (*row.families, NONE)
                 beside.append(replace(row, driver=IRREGULAR, families=families, log_evidence=log))
-        for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver):
-            k = self._best[self._run.walk]
+        for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver and row.refit):
+            k, left = self._best[self._run.walk], trend(row.refit.fit) if row.refit else None
             within = self._run.courses_beside(k, self._likeliest_noise(k)).log_bayes_alike
+            # the term's waves are too long for the walk within a dwell, of which the refit's noise has all
+            within = min(within, log_odds_of(left.p_value)) if left else within
             walked.append(row.log_evidence + within + math.log(_WITHIN))
         return [
             replace(row, log_evidence=_log_sum([row.log_evidence, *walked])) if row.driver == IRREGULAR else row
