@@ -87,6 +87,19 @@ def _p_values(random: np.random.Generator, runs: int, correlated: float, size: f
     return np.array(found)
 
 
+def test_what_slews_do_not_show_of_an_effect_is_left_out() -> None:
+    """A coefficient without a column, and one that is the sum of two others, made the covariance singular."""
+    parts = SimpleNamespace(model=SimpleNamespace(parts={"latency": slice(12, 16), "nothing": slice(16, 17)}))
+    random = np.random.default_rng(5)
+    design = np.concatenate([random.standard_normal((12, 30, 14)), np.zeros((12, 30, 3))], axis=2)
+    design[..., 14] = design[..., 12] + design[..., 13]
+    for size, named in ((0.0, False), (1.0, True)):
+        readings = random.standard_normal((12, 30)) + size * design[..., 12]
+        rows = np.concatenate([design, readings[..., None]], axis=2)
+        jackknife = _Jackknife(cast("Fit", _Rows(list(rows), parts)))
+        assert jackknife.p_value("nothing") == 1.0 and (jackknife.p_value("latency") < 1e-6) == named
+
+
 @pytest.mark.parametrize("correlated", [0.0, 0.5, 3.0])
 def test_p_values_of_slews_hold_in_noise_that_is_common_to_a_slew(correlated: float) -> None:
     random = np.random.default_rng(8)

@@ -114,3 +114,16 @@ def test_what_swings_in_one_long_pose_of_a_real_unit_is_not_named_beside_the_tru
     if name == "hysteresis" and len(found.missing) > 1:
         pytest.xfail("what creeps after each turn by hand is taken for memory beside it (docs/limits.md)")
     assert found.missing == (name,), found.verdict
+
+
+@pytest.mark.slow
+def test_poses_too_short_for_averages_stop_no_diagnosis_of_a_real_board() -> None:
+    """Of 24 poses three last 0.4 s; with three dwells less, vibration-rectification was fitted, and a ValueError."""
+    path = REAL / "array_2_unit1.csv.gz"
+    if not path.exists():
+        pytest.skip("the recordings of others are not there")
+    recording = TurnedRecording(path)
+    added = injected(recording, "bias-asymmetry", 15.0, 1)
+    assert added is not None
+    found = kf_calib.diagnose(recording.altered(added))
+    assert found.missing == ("bias-asymmetry",) and found.sure, found.verdict
