@@ -310,9 +310,8 @@ def share_in_words(driver: Driver) -> str:
 
 def name_of(row: Hypothesis) -> str:
     """An explanation in a few words, for a line of a table or figure."""
-    if row.formulas:
-        return " + ".join((*row.effects, f"formula of {row.driver}"))
-    return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
+    unknown = f"formula of {row.driver}" if row.formulas else f"{row.driver} changes" if row.driver else ""
+    return " + ".join([*row.effects, *([unknown] if unknown else [])]) or row.families[0]
 
 
 def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
