@@ -197,7 +197,7 @@ class RunPosterior:
             share = self._share_of_unknown(family)
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
-        within = self._run.likelihood.courses.log_bayes_alike
+        within = max(self._run.likelihood.courses.log_bayes_alike, 0.0)  # it need not change within dwells
         log_nothing, log_irregular = noises[0][1] + prior, _log_sum(irregular) + within
         if self._test.consistent is False:  # chance, or a cause of which there is no term: at least as p has it
             odds = log_odds_of(self._test.p_value or 0.0) + math.log(PRIOR["unknown"] / PRIOR["nothing"])
@@ -514,12 +514,14 @@ class RunPosterior:
             if within > 0.0:
                 log, families = row.log_evidence + within + math.log(_WITHIN), (*row.families, NONE)
                 beside.append(replace(row, driver=IRREGULAR, families=families, log_evidence=log))
-        for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver and row.refit):
-            k, left = self._best[self._run.walk], trend(row.refit.fit) if row.refit else None
-            within = self._run.courses_beside(k, self._likeliest_noise(k)).log_bayes_alike
-            # the term's waves are too long for the walk within a dwell, of which the refit's noise has all
-            within = min(within, log_odds_of(left.p_value)) if left else within
-            walked.append(row.log_evidence + within + math.log(_WITHIN))
+        for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver):
+            left = trend(row.refit.fit) if row.refit and self._test.trend else None
+            if left is not None:
+                k = self._best[self._run.walk]
+                within = self._run.courses_beside(k, self._likeliest_noise(k)).log_bayes_alike
+                # the term's waves are too long for the walk within a dwell, of which the refit's noise has all
+                within = min(within, log_odds_of(left.p_value))
+                walked.append(row.log_evidence + within + math.log(_WITHIN))
         return [
             replace(row, log_evidence=_log_sum([row.log_evidence, *walked])) if row.driver == IRREGULAR else row
             for row in rows

@@ -30,7 +30,6 @@ from kf_calib.dwells.qr import spanned
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
-from kf_calib.estimation.estimate import HOPELESS
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior
 from kf_calib.noise.means import means_of
@@ -41,8 +40,10 @@ _FINE = 8  # parts of a step over which the likelihood is integrated
 _FAR = 300.0  # in log likelihood, below the largest: a polynomial through values that differ by more swings out
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
+_ROUNDING = 1e-13  # of columns of a length of one: their prior may be as small beside what is known best
 _FACTORS = 8  # of which a product is a double, whatever the sizes
 
+_ANY = Prior(misalignment_rad=math.pi, scale=10.0, bias_mps2=100.0)
 _EXACT = 0.01  # to which log likelihoods are known
 _NONE = np.zeros(0)
 
@@ -274,15 +275,13 @@ def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats | 
 
 
 def _prior_of_twelve(model: Model, states: int) -> Floats:
-    """Return rows (12, P) of a prior of the twelve parameters as wide as what counts as not determined, about where
-    they are.
+    """Return rows (12, P) of a prior of the twelve parameters about where they are, within which is any sensor.
 
     Without it a direction that the orientations do not show takes a degree of freedom as soon as the fit of an effect
     is off nominal by so little that its columns are no longer zero.
     """
-    prior = Prior(HOPELESS["rad"], HOPELESS["1"], HOPELESS["m/s^2"])
-    covariance = prior.covariance(paper_parameters.nominal(model.bench.nominal))
     rows = np.zeros((STATE_COUNT, states))
+    covariance = _ANY.covariance(paper_parameters.nominal(model.bench.nominal))
     rows[:, :STATE_COUNT] = np.linalg.inv(np.linalg.cholesky(covariance))
     return rows
 
@@ -293,7 +292,7 @@ def _off(
     """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the columns are
     overwritten."""
     whole = np.concatenate([model.reshape(-1, model.shape[2]), more_model])
-    basis, _, log_volume = spanned(whole)
+    basis, _, log_volume = spanned(whole, _ROUNDING)
     of_means, more = basis[: z.size].reshape(*z.shape, -1), basis[z.size :]
     onto = more.T @ more_columns
     for few in portions(len(columns), AT_ONCE // 8):

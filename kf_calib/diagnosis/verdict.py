@@ -20,13 +20,14 @@ from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import effect_named
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
-from kf_calib.estimation.results import Parameter, format_p
+from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import counted, listing
 from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
 _TOLD, _WORTH_A_NAME = 4, 1e-3  # most other explanations that are told, and least probability of one
+_LEFT = 2.0  # times the noise at rest, from which on it is said what readings of slews have beyond an effect
 _UNUSUAL = 5.0  # times the greatest usual size, from which a coefficient is said to be too large for its name
 _USUAL = {"angle_sigma_deg": " (a usual table: 0.0003 to 0.003 deg)", "scatter_sigma_mps2": ""}
 _FAMILIES = {
@@ -352,7 +353,7 @@ def _held_out(diagnosis: Diagnosis) -> str:
     before, after = diagnosis.before, diagnosis.after
     assert after is not None
     if after.model.dynamic and not before.model.dynamic:
-        return " It changes no reading at rest."
+        return f" It changes no reading at rest{_left_in_slews(after)}."
     floor = diagnosis.floor_mps2
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not floor:
         return ""
@@ -361,6 +362,13 @@ def _held_out(diagnosis: Diagnosis) -> str:
         f" Adding {added} takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
         f"{after.held_out_rms_mps2 / floor:.2f} times what noise gives."
     )
+
+
+def _left_in_slews(after: Calibration) -> str:
+    """Return in words what a model leaves of the readings of slews, over the noise at rest; "" where it is that."""
+    slew_mps2 = after.noise.slew_sigma_mps2
+    times = 0.0 if slew_mps2 is None else float(np.max(slew_mps2 / np.maximum(after.noise.sigma_mps2, 1e-300)))
+    return f"; what it leaves while the platform turns is still {times:.2g} times the noise" if times > _LEFT else ""
 
 
 def _unusual(diagnosis: Diagnosis) -> str:

@@ -79,5 +79,5 @@ def test_an_effect_with_which_a_run_tells_nothing_is_no_explanation() -> None:
     """Nearly level rests of a sensor in the hand (D. Laidig et al., BROAD), some of them moving: with `cross-talk`,
     which was part of it with 99.5 %, none of the twelve is determined."""
     found = diagnose(open_log(BROAD, {"gravity_mps2": str(G), "up": "z"}), replicate=False)
-    assert not found.missing and found.unknown and found.table is not None, found.verdict
+    assert not found.sure and found.table is not None, found.verdict
     assert found.table.probability(("cross-talk",)) < 0.01
