@@ -360,7 +360,11 @@ class RunPosterior:
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}
-        return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
+        noises = {f"?{k}" for k, unknown in enumerate(self._run.unknown) if not unknown.summands}
+        return [
+            self._row_of(both, log if {*both} & noises else _beside_function(both, log, alone_of))
+            for both, log in pairs.items()
+        ]
 
     def _summands_to_pair(self) -> list[int]:
         """Return the numbers of the likeliest summands of the unknown functions in which one is likeliest."""
@@ -631,7 +635,7 @@ class RunPosterior:
 def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:
     """Return the log evidence of a row where what an effect gains beside an unknown function counts in part, as far as
     this explains more alone: no function is just one that is tried, and what it leaves is no noise of independent
-    dwells."""
+    dwells. What changes irregularly has no formula: it is noise, with which all of it counts."""
     function = max((alone[name] for name in names if name.startswith("?")), default=-math.inf)
     effect = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
     return log - (1.0 - INDEPENDENT) * max(min(function - effect, log - function), 0.0)

@@ -193,7 +193,7 @@ class RunTerms:
         """Add a random walk of the biases and, unknown, one of the scale factors; either as the integral of a walk is,
         smooth, with a spectrum that falls with w^2 more; and biases that change as irregularly and come back: the
         spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
-        w^2 tau^2 / (1 + w^2 tau^2)."""
+        w^2 tau^2 / (1 + w^2 tau^2), and that of 1/f noise is that of a walk times w."""
         dwells = self._linearised.dwells
         run_s, count = dwells[-1].end_s, min(max(len(dwells), _FEWEST_WAVES), _WAVES)
         walks = [_Walk(run_s, most, of_scale) for of_scale in (False, True) for most in (count, min(count, _SMOOTH))]
@@ -203,6 +203,7 @@ class RunTerms:
         smooth = rates[0] / walks[1].rates
         taus_s = [run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
         returning = [1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s]
+        returning.append(np.sqrt(rates / rates[-1]))
         family = effect_named(self.walk, self.bench).family
         columns.irregular(self.walk, of_bias, [even])
         for driver, of_driver, block, scales in (
