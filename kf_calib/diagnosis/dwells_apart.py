@@ -75,13 +75,18 @@ class DwellsApart:
         ]
         return np.concatenate(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)
 
-    def _of_means(self, gram: Floats, along: Floats) -> Floats:
-        """Return log Bayes factors (K, D) of changes of the mean of each dwell: gram (K, D, 3, 3), along (K, D, 3)."""
-        offsets = log_bayes_of_any_size(gram, along)
+    def _of_means(self, gram: Floats, along: Floats, largest: Floats) -> Floats:
+        """Return log Bayes factors (K, D) of changes of the mean of each dwell: gram (K, D, 3, 3), along (K, D, 3), and
+        the largest squares (K, D) before the model was subtracted."""
+        offsets = log_bayes_of_any_size(gram, along, largest)
         if not self.sizes.turns:
             return offsets
         of_turns = [
-            log_bayes_of_any_size(turn.swapaxes(1, 2) @ gram @ turn, (along[:, :, None] @ turn)[:, :, 0])
+            log_bayes_of_any_size(
+                turn.swapaxes(1, 2) @ gram @ turn,
+                (along[:, :, None] @ turn)[:, :, 0],
+                largest * np.sum(turn**2, axis=(1, 2)),
+            )
             for turn in (of_gimbal[..., None] for of_gimbal in self.sizes.turns.values())
         ]
         of_one = np.logaddexp.reduce(of_turns) - math.log(len(of_turns))

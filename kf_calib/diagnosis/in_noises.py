@@ -131,9 +131,9 @@ class InNoises:
     def __len__(self) -> int:
         return len(self.logs)
 
-    def dwells(self, rows: Spanned, without: Sequence[int], sizes: slice) -> tuple[Floats, Floats]:
+    def dwells(self, rows: Spanned, without: Sequence[int], sizes: slice) -> tuple[Floats, Floats, Floats]:
         """G^T W G (K, D, 3, 3) and G^T W z (K, D, 3) of offsets of the three accelerometers in one dwell, as the others
-        tell, without some of them, in some of the sizes.
+        tell, without some of them, in some of the sizes; and the largest squares (K, D) of what was not projected.
 
         rows: of the run, with or without columns that are in the model. Raises LinAlgError where the other dwells do
         not determine it.
@@ -151,10 +151,8 @@ class InNoises:
         states = np.swapaxes(inverse, 1, 2) @ (inverse @ along[..., None])
         left = (rows.readings[..., None] - rows.basis @ states[:, None]) * kept
         off = inverse[:, None] @ np.swapaxes(weighted * kept, 2, 3)
-        gram = weights - np.swapaxes(off, 2, 3) @ off
-        traces = np.einsum("kdii->kd", gram), np.einsum("kdii->kd", weights)
-        seen = traces[0] > ROUNDING * traces[1]  # what the model leaves of them
-        return gram * seen[..., None, None], (weights @ left)[..., 0] * seen[..., None]
+        gram, largest = weights - np.swapaxes(off, 2, 3) @ off, np.einsum("kdii->kdi", weights).max(axis=2)
+        return gram, (weights @ left)[..., 0], largest
 
     def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[Floats]:
         """What the columns (q,) of each group explain of all columns and of the readings, (K, q, C + 1) in K of the

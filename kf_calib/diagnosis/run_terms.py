@@ -549,9 +549,10 @@ def log_bayes_of_columns(columns: Floats, readings: Floats) -> float:
     return float(log_bayes_of_any_size((columns.T @ columns)[None], (columns.T @ readings)[None])[0])
 
 
-def log_bayes_of_any_size(gram: Floats, along: Floats) -> Floats:
-    """Log Bayes factors (..., n) of n terms of any size from G^T G (..., n, q, q) and G^T z (..., n, q)."""
+def log_bayes_of_any_size(gram: Floats, along: Floats, lengths: Floats | None = None) -> Floats:
+    """Log Bayes factors (..., n) of n terms of any size from G^T G (..., n, q, q) and G^T z (..., n, q); lengths as of
+    ``log_bayes``."""
     largest = np.einsum("...qq->...q", gram).max(axis=(-2, -1))
     sizes = sizes_of(1.0, None)
     squares = sizes.values**2 / np.maximum(largest, 1e-40)[..., None, None]
-    return log_bayes(gram, along, squares, sizes.logs, np.zeros(gram.shape[-3]))
+    return log_bayes(gram, along, squares, sizes.logs, np.zeros(gram.shape[-3]), lengths)
