@@ -71,6 +71,8 @@ _ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise wi
 _AT_ONCE = 8  # sizes of noise, of which the products of all columns are copied
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
+_Fitted = tuple[Hypothesis, Spanned, Courses]
+
 
 class RunPosterior:
     """The posterior of one run.
@@ -104,7 +106,8 @@ class RunPosterior:
         rows = [*self._without_terms(), *self._singles(), *self._dwells_apart()]
         if refitted:
             rows = self._fitted(_merged([*rows, *self._pairs()]))
-            rows = _with_sure_dwells(self._with_changes_within(rows), self._dwells_beside(rows))
+            fitted = self._likeliest_fitted(rows)
+            rows = _with_sure_dwells(self._with_changes_within(rows, fitted), self._dwells_beside(rows, fitted))
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         table = replace(table_of(rows), scattering=self._scattering)
         return replace(table, same=self._same_as(table.first)) if refitted else table
@@ -285,12 +288,11 @@ class RunPosterior:
         """Return the numbers of some of the dwells."""
         return tuple(self._before.fit.dwells[k].number for k in places)
 
-    def _dwells_beside(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+    def _dwells_beside(self, rows: Sequence[Hypothesis], fitted: Sequence[_Fitted]) -> list[Hypothesis]:
         """Return the rows of dwells that are off beside the likeliest effects, and unknown functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
-        fitted = self._likeliest_fitted(rows)
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
-        beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
+        beside = [self._with_dwells(*each) for each in fitted]
         run = self._run.likelihood
         for row in unknown[:_BESIDE]:
             if (courses := self._courses_beside(row)) is not None:
@@ -508,14 +510,12 @@ class RunPosterior:
         log += self._log_prior(row.effects) + sum(map(self._log_share_of_constant, row.effects))
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
-    def _with_changes_within(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+    def _with_changes_within(self, rows: Sequence[Hypothesis], fitted: Sequence[_Fitted]) -> list[Hypothesis]:
         """Return rows with those of irregular changes beside the likeliest effects, for which speaks what these leave
         within dwells; beside a random walk of the biases all of it is irregular."""
         beside, walked = list[Hypothesis](), list[float]()
-        for row in self._likeliest_fitted(rows):
-            assert row.refit is not None
-            within = self._where_fitted(row.refit)[1].log_bayes_alike
-            if within > 0.0:
+        for row, _, courses in fitted:
+            if (within := courses.log_bayes_alike) > 0.0:
                 log, families = row.log_evidence + within + math.log(_WITHIN), (*row.families, NONE)
                 beside.append(replace(row, driver=IRREGULAR, families=families, log_evidence=log))
         for row in (row for row in rows if row.effects == (self._run.walk,) and not row.driver):
@@ -531,10 +531,12 @@ class RunPosterior:
             for row in rows
         ] + beside
 
-    def _likeliest_fitted(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the likeliest rows of effects that were fitted, without a random walk."""
+    def _likeliest_fitted(self, rows: Sequence[Hypothesis]) -> list[_Fitted]:
+        """Return the likeliest rows of effects that were fitted, without a random walk, each with the rows of the run
+        and what is left of its courses there."""
         known = [row for row in rows if row.effects and not row.driver and self._run.walk not in row.effects]
-        return sorted((row for row in known if row.refit is not None), key=lambda row: -row.log_evidence)[:_ALWAYS]
+        known = sorted((row for row in known if row.refit is not None), key=lambda row: -row.log_evidence)[:_ALWAYS]
+        return [(row, *self._where_fitted(row.refit)) for row in known if row.refit]
 
     def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and

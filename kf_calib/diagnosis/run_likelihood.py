@@ -1,7 +1,7 @@
 """One likelihood of a run for all explanations: what each adds are columns with a prior of their size.
 
-The means of the dwells z (3 D,) of a model with the columns H are N(H x + G c, V): x has a flat prior, the coefficients
-c of a term N(m, s^2), and V is the noise that was stated, with scatter s_s and setting errors s_a of unknown size where
+The means of the dwells z (3 D,) of a model with the columns H are N(H x + G c, V): x has a prior as wide as any sensor
+needs, the coefficients c of a term N(m, s^2), and V is the noise that was stated, with scatter s_s and setting errors s_a of unknown size where
 nothing was stated of them. The readings within dwells add rows that noise from dwell to dwell does not enter. With the
 rows whitened by V and projected off H, and w the eigenvalues of G^T G and t the projections of z on its eigenvectors,
 
