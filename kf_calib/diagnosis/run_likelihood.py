@@ -3,7 +3,8 @@
 The means of the dwells z (3 D,) of a model with the columns H are N(H x + G c, V): x has a prior as wide as any sensor
 needs, the coefficients c of a term N(m, s^2), and V is the noise that was stated, with scatter s_s and setting errors
 s_a of unknown size where nothing was stated of them. The readings within dwells add rows that noise from dwell to dwell
-does not enter. With the rows whitened by V and projected off H, and w the eigenvalues of G^T G and t the projections of z on its eigenvectors,
+does not enter. With the rows whitened by V and projected off H, and w the eigenvalues of G^T G and t the projections of
+z on its eigenvectors,
 
   log B(s) = -1/2 sum log(1 + s^2 w) + 1/2 sum s^2 t^2 / (1 + s^2 w)
 
