@@ -21,6 +21,7 @@ FOLDER = ROOT / "tests" / "golden" / "numbers"
 RENEW = "python tools/golden_numbers.py"
 _RELATIVE, _OF_SIGMA = 1e-5, 1e-4
 _ZERO = 1e-12
+_UNTOLD = 1e-3
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z][\w:=^*().+-]{0,40}( [\w:=^*().+-]+){0,2}")
 _NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?")
@@ -65,10 +66,15 @@ def plain(tree: Any) -> Any:
         case float():
             return float(f"{tree:.{_DIGITS}g}") if math.isfinite(tree) else str(tree)
         case Sequence():
-            return [plain(part) for part in tree]
+            return [plain(part) for part in tree if not _is_untold(part)]
         case _ if hasattr(tree, "tolist"):
             return plain(tree.tolist())
     return tree
+
+
+def _is_untold(part: Any) -> bool:
+    """Whether it is an explanation so unlikely that no verdict tells it: the order of such is one of rounding."""
+    return isinstance(part, Mapping) and "log10_odds_to_next" in part and part.get("probability", 1.0) < _UNTOLD
 
 
 def read(name: str) -> Any:
