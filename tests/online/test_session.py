@@ -324,7 +324,7 @@ def test_memory_of_a_run_of_days_is_flat() -> None:
     finally:
         tracemalloc.stop()
     assert len(kept) == 60
-    # the readings of a dwell are 0.6 MB; what two threads just work on differs by up to 7 MB where others need the processor
+    # the readings of a dwell are 0.6 MB; what two threads just work on differs by up to 7 MB on a busy machine
     assert min(kept[45:59]) - min(kept[16:30]) < 0.3 * 29.0, kept
 
 
