@@ -195,7 +195,7 @@ CEILINGS = {
     "noise": 3406,
     "estimation": 7893,
     "design": 1879,
-    "diagnosis": 6114,
+    "diagnosis": 6113,
     "online": 1631,
     "exchange": 1962,
     "views": 6907,

@@ -362,11 +362,9 @@ class RunPosterior:
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}
-        noises = {f"?{k}" for k, unknown in enumerate(self._run.unknown) if not unknown.summands}
-        return [
-            self._row_of(both, log if {*both} & noises else _beside_function(both, log, alone_of))
-            for both, log in pairs.items()
-        ]
+        for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
+            alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
+        return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
 
     def _summands_to_pair(self) -> list[int]:
         """Return the numbers of the likeliest summands of the unknown functions in which one is likeliest."""
@@ -534,9 +532,10 @@ class RunPosterior:
     def _likeliest_fitted(self, rows: Sequence[Hypothesis]) -> list[_Fitted]:
         """Return the likeliest rows of effects that were fitted, without a random walk, each with the rows of the run
         and what is left of its courses there."""
-        known = [row for row in rows if row.effects and not row.driver and self._run.walk not in row.effects]
-        known = sorted((row for row in known if row.refit is not None), key=lambda row: -row.log_evidence)[:_ALWAYS]
-        return [(row, *self._where_fitted(row.refit)) for row in known if row.refit]
+        known = [row for row in rows if row.refit and row.effects and not row.driver]
+        known = [row for row in known if self._run.walk not in row.effects]
+        likeliest = sorted(known, key=lambda row: -row.log_evidence)[:_ALWAYS]
+        return [(row, *self._where_fitted(row.refit)) for row in likeliest if row.refit]
 
     def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and
@@ -638,7 +637,7 @@ def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) 
     """Return the log evidence of a row where what an effect gains beside an unknown function counts in part, as far as
     this explains more alone: no function is just one that is tried, and what it leaves is no noise of independent
     dwells. What changes irregularly has no formula: it is noise, with which all of it counts."""
-    function = max((alone[name] for name in names if name.startswith("?")), default=-math.inf)
+    function = max((alone.get(name, -math.inf) for name in names if name.startswith("?")), default=-math.inf)
     effect = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
     return log - (1.0 - INDEPENDENT) * max(min(function - effect, log - function), 0.0)
 

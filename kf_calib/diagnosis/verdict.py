@@ -306,9 +306,9 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
 def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
-        rest = " beside irregular changes within dwells" if row.driver == IRREGULAR else ""
-        beside = rest or (f" beside no known effect, which goes with {row.driver}" if row.driver else "")
-        return f"{_effects_of(row)}{beside}"
+        if row.driver == IRREGULAR:
+            return f"{_effects_of(row)} beside irregular changes within dwells"
+        return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.driver else "")
     if row.families == (NOTHING,):
         return "nothing missing"
     if row.driver:
