@@ -316,8 +316,10 @@ class RunPosterior:
         likelihood, logs, grams, along = self._in_noises_of(refit)
         k = int(np.argmax(logs + _gains(grams, along)))
         likeliest = np.linalg.pinv(grams[k], ROUNDING, hermitian=True) @ along[k]
-        courses = likelihood.courses_at(np.append(refit.linearised.state[: -len(likeliest)], likeliest))
-        return likelihood.spanned.beside(np.arange(len(likeliest)), likelihood.lengths), courses
+        places = np.arange(len(likeliest))
+        known = likelihood.states_beside(self._sizes.covariances[k], places, likeliest)
+        courses = likelihood.courses_at(np.append(known, likeliest))
+        return likelihood.spanned.beside(places, likelihood.lengths), courses
 
     def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:
         """Return a row with dwells that are off beside what it has, which is in the model of ``rows``.

@@ -116,7 +116,7 @@ class RunLikelihood:
         _combine(more, blocks, combined[len(of_prior) :])
         self.lengths = np.sqrt(_squares(columns) + np.einsum("rc,rc->c", combined, combined))
         more_z, of_model = np.append(np.zeros(len(of_prior)), more_z), np.concatenate([of_prior, of_model])
-        self.spanned = _off(whitened, columns, z, of_model, combined, more_z)
+        self.spanned, self._to_states, self._along, self._onto = _off(whitened, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
         self.spanned = replace(self.spanned, log=self.spanned.log + log_root + within.log)
 
@@ -156,6 +156,19 @@ class RunLikelihood:
             within.add(some, values[pieces], added.values, pieces, np.maximum(squares - np.sum(along**2, axis=0), 0.0))
         return columns, within
 
+    def states_beside(self, covariances: Floats | None, places: Indices, coefficients: Floats) -> Floats:
+        """The known states of the model (p,) as they are likeliest beside coefficients (q,) of some columns, with
+        further noise, (D, 3, 3) in units of that stated: the fit may not have come to its end, or be of other noise."""
+        rows = self.spanned
+        left = rows.readings - rows.columns[..., places] @ coefficients
+        parts = [rows.basis, left[..., None]]
+        if covariances is not None:
+            parts = [np.linalg.solve(np.linalg.cholesky(lift_rounding(np.eye(3) + covariances)), p) for p in parts]
+        more = [rows.more_basis, (rows.more_readings - rows.more_columns[:, places] @ coefficients)[:, None]]
+        basis, z = (np.vstack([p.reshape(-1, p.shape[2]), m]) for p, m in zip(parts, more, strict=True))
+        along = np.linalg.lstsq(basis, z[:, 0])[0] + self._along - self._onto[:, places] @ coefficients
+        return self.linearised.state[: self._known] + (self._to_states @ along)[: self._known]
+
     def courses_at(self, state: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE) -> Courses:
         """What the model leaves at some state (p,) of the courses of the readings within dwells, with effects of some
         coefficients (C,) that are not in it."""
@@ -177,6 +190,7 @@ class RunLikelihood:
         """Multiply the columns of the terms by these (C,)."""
         for columns in (self.spanned.columns, self.spanned.more_columns):
             columns *= scales
+        self._onto *= scales
         self.lengths, self.scales = self.lengths * scales, scales
 
     def columns(self, places: Indices) -> Floats:
@@ -289,11 +303,12 @@ def _prior_of_twelve(model: Model, states: int) -> Floats:
 
 def _off(
     model: Floats, columns: Floats | Singles, z: Floats, more_model: Floats, more_columns: Floats, more_z: Floats
-) -> Spanned:
-    """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the columns are
+) -> tuple[Spanned, Floats, Floats, Floats]:
+    """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the matrix (P, k) from
+    what it spans to its states, and what is along it of the readings (k,) and of the columns (k, C), which are
     overwritten."""
     whole = np.concatenate([model.reshape(-1, model.shape[2]), more_model])
-    basis, _, log_volume = spanned(whole, _ROUNDING)
+    basis, to_states, log_volume = spanned(whole, _ROUNDING)
     of_means, more = basis[: z.size].reshape(*z.shape, -1), basis[z.size :]
     onto = more.T @ more_columns
     for few in portions(len(columns), AT_ONCE // 8):
@@ -304,7 +319,8 @@ def _off(
         more_columns[few] -= more[few] @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
     # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain
-    return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)
+    off = Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)
+    return off, to_states, along, onto
 
 
 def _eigen(gram: Floats, lengths: Floats | None) -> tuple[Floats, Floats, Floats]:

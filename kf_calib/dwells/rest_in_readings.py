@@ -5,7 +5,9 @@ The readings are cut into windows of a quarter of a second. The noise is that of
 minutes: the lower quartile of their variances, which are chi-squared distributed where the sensor rests. A window is
 still if its variance is within what that noise leaves to chance. A dwell begins with a second of still windows of one
 mean, within six sigma and the tolerance of ``Stillness``, and goes on as long as the windows agree with the one before
-and with the mean so far. One window that is not still, as by an outlier, does not end a dwell.
+and with the mean so far. One window that is not still, as by an outlier, does not end a dwell. Where a motion that
+begins gently, with the square of time, is seen in the last two seconds of a dwell, these are left out from its begin
+on; so is the end of one in the first two.
 
 Nothing is decided with readings that come later than half a second, so that a live run and the replay of its recording
 find the same dwells, however the readings are divided into batches.
@@ -19,7 +21,7 @@ import copy
 import math
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,6 +37,7 @@ from kf_calib.support.tail_probabilities import normal_quantile
 
 _LEAST_WINDOWS = SECOND_NS // READING_WINDOW_NS  # of a dwell
 _REMEMBERED = 1200  # windows whose variances tell the noise: five minutes
+_EDGE = 8  # windows at either end of a dwell in which a motion is looked for; of a short dwell a third
 _VARIANCE_MARGIN = 1.5  # correlated noise has fewer degrees of freedom than readings
 _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
 _ANY_ATTITUDE = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
@@ -127,14 +130,15 @@ class RestSegmenter(Segmenter):
             return False
         period_ns = float(np.median(np.diff(self._accel.time_ns[: SAMPLE + 1])))
         self._size = max(FEWEST_COMPARED, round(READING_WINDOW_NS / max(period_ns, 1.0)))
-        self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
+        self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1))
         return True
 
-    def _add_window(self, window: _Window, largest_variance: float, allowed: float) -> Iterator[Block]:
+    def _add_window(self, window: _Window, largest_variance: float, noise: float) -> Iterator[Block]:
         """Take one more window into the run of still windows, or end that run and yield its last blocks."""
         run, still = self._run, window.variance <= largest_variance
-        if run is not None and still and run.agrees(window, allowed):
-            run.add(window, self._stamp(window.end - 1))
+        tolerance = self.stillness.tolerance_rad * self.bench.gravity_mps2
+        if run is not None and still and run.agrees(window, noise, tolerance):
+            run.add(window, self._stamp(window.end - 1), noise)
             if run.number is None and run.count >= _LEAST_WINDOWS:
                 self._begin(run, window, largest_variance)
         elif still or run is None or run.interrupted:
@@ -156,15 +160,15 @@ class RestSegmenter(Segmenter):
     def _new_run(self, first: _Window) -> _StillRun:
         """Return a run of one window."""
         stamps = self._stamp(first.begin), self._stamp(first.end - 1)
-        return _StillRun(first.begin, first.end, *stamps, first.mean, first.mean, first.variance)
+        return _StillRun(first.begin, first.end, *stamps, first.mean, first.mean, first.variance, [first])
 
     def _whole_blocks(self, run: _StillRun) -> Iterator[Block]:
         """Yield the whole blocks of the open dwell that no departure can take back."""
         settle_ns = self.stillness.settle_ns if run.begin else 0
-        if run.end_ns - run.arrival_ns < 3 * settle_ns:
+        if run.end_ns - run.arrival_ns < 3 * settle_ns or run.arrived is None:
             return
         self._settle(run, settle_ns)
-        end = self._index(run.end_ns - self.stillness.lead_ns)
+        end = min(self._index(run.end_ns - self.stillness.lead_ns), run.latest[0].begin)
         while end - self._dropped >= BLOCK_SAMPLES:
             yield self._next_block(run, BLOCK_SAMPLES)
 
@@ -180,6 +184,7 @@ class RestSegmenter(Segmenter):
             self.counts.least_settling_s = min(self.counts.least_settling_s, settle_ns / SECOND_NS)
         self._settle(run, settle_ns)
         end = self._index(run.end_ns - min(self.stillness.lead_ns, length_ns // 10)) if departed else run.end
+        end = min(end, run.departing) if departed else end
         while self._dropped < end:
             yield self._next_block(run, min(BLOCK_SAMPLES, end - self._dropped))
         self.counts.settling += run.end - self._dropped
@@ -190,7 +195,8 @@ class RestSegmenter(Segmenter):
         if run.settled:
             return
         run.settled = True
-        count = self._index(run.arrival_ns + settle_ns) - self._dropped
+        arrived = run.ended_arrival if run.arrived is None else run.arrived
+        count = max(self._index(run.arrival_ns + settle_ns), arrived if run.begin else 0) - self._dropped
         self.counts.settling += count
         self._release(count)
 
@@ -254,8 +260,10 @@ class _StillRun:
     """A run of still windows; a dwell once it has a number.
 
     begin, end: places of its first reading and of the one after its last. last, total (3,): mean of its last window,
-    and sum of all means. loudest: the largest variance of its windows. interrupted: whether the window after it is not
-    still. settled: whether the margin after the arrival is released.
+    and sum of all means. loudest: the largest variance of its windows. first, latest: its windows at either end. noise:
+    by how much their means may be off by chance. arrived: place where the arrival no longer shows; None while that is
+    not known. interrupted: whether the window after it is not still. settled: whether the margin after the arrival is
+    released.
     """
 
     begin: int
@@ -265,21 +273,65 @@ class _StillRun:
     last: Floats
     total: Floats
     loudest: float
+    first: list[_Window]
+    latest: deque[_Window] = field(default_factory=lambda: deque[_Window](maxlen=_EDGE))
+    noise: float = math.inf
+    arrived: int | None = None
     count: int = 1
     number: int | None = None
     interrupted: bool = False
     settled: bool = False
 
-    def agrees(self, window: _Window, allowed: float) -> bool:
-        """Whether the mean of a window is near that of the window before, and near that of the run."""
+    def agrees(self, window: _Window, noise: float, tolerance: float) -> bool:
+        """Whether the mean of a window is near that of the window before, and near that of the run; noise: by how much
+        a mean may be off by chance; tolerance: by how much it may move in the window of ``Stillness``."""
         moved, apart = window.mean - self.last, window.mean - self.total / self.count
-        return bool(moved @ moved <= 2.0 * allowed**2 and apart @ apart <= 4.0 * allowed**2)
+        largest = math.sqrt(2.0) * noise + 0.5 * tolerance
+        return bool(moved @ moved <= largest**2 and apart @ apart <= 4.0 * (noise + tolerance) ** 2)
 
-    def add(self, window: _Window, end_ns: int) -> None:
+    def add(self, window: _Window, end_ns: int, noise: float) -> None:
         """Add the next still window."""
         self.end, self.end_ns, self.last, self.interrupted = window.end, end_ns, window.mean, False
         self.total, self.count = self.total + window.mean, self.count + 1
-        self.loudest = max(self.loudest, window.variance)
+        self.loudest, self.noise = max(self.loudest, window.variance), noise
+        self.latest.append(window)
+        if self.count <= 2 * _EDGE:
+            self.first.append(window)
+        if self.count == 3 * _EDGE:
+            self.arrived = self.ended_arrival
+
+    @property
+    def ended_arrival(self) -> int:
+        """Place of the first reading in which the arrival no longer shows."""
+        edge = min(_EDGE, self.count // 3)
+        windows, rest = self.first[:edge][::-1], self.first[edge : 2 * edge]
+        moving = self._moving(windows, np.sum([each.mean for each in rest], axis=0), len(rest))
+        return self.first[moving].begin
+
+    @property
+    def departing(self) -> int:
+        """Place of the first reading in which the departure shows."""
+        edge = min(_EDGE, self.count // 3)
+        windows, before = [*self.latest][len(self.latest) - edge :], self.first[:edge]
+        away = np.sum([each.mean for each in (*windows, *before)], axis=0)
+        moving = self._moving(windows, self.total - away, self.count - 2 * edge)
+        return windows[-moving].begin if moving else self.end
+
+    def _moving(self, windows: Sequence[_Window], total: Floats, count: int) -> int:
+        """Return how many of the last windows show a motion that begins there, or ends in the first.
+
+        Where the squares (1, 4, ..., k^2) explain more of what the last k means are off the rest than chance, they are
+        left out one by one until it is no more, and one besides. total (3,): sum of the means of the rest, of which
+        there are ``count``.
+        """
+        away, moving = np.array([each.mean for each in windows]) - total / max(count, 1), 0
+        for last in range(len(windows), 0, -1):
+            shapes = [np.append(np.zeros(last - k), np.arange(1.0, k + 1.0) ** 2) for k in range(1, last + 1)]
+            noise = self.noise / SIGMAS * np.array([math.sqrt(s @ s + s.sum() ** 2 / count) for s in shapes])
+            if np.max(np.linalg.norm(np.array(shapes) @ away[:last], axis=1) / noise) < SIGMAS:
+                break
+            moving += 1
+        return min(moving + 1, len(windows)) if moving else 0
 
 
 @dataclass
@@ -291,7 +343,6 @@ class _RestNoise:
 
     gravity_mps2: float
     freedom: int
-    tolerance_rad: float
     latest: deque[float] = field(default_factory=deque[float])
     ordered: list[float] = field(default_factory=list[float])
 
@@ -303,14 +354,13 @@ class _RestNoise:
             del self.ordered[bisect_left(self.ordered, self.latest.popleft())]
 
     def bounds(self, count: int) -> tuple[float, float]:
-        """The largest variance of a window that is still, and by how much its mean of ``count`` readings may move."""
+        """The largest variance of a window that is still, and by how much its mean of ``count`` readings may be off."""
         rank = 0.25 * (len(self.ordered) - 1)
         low, high = self.ordered[math.floor(rank)], self.ordered[math.ceil(rank)]
         quartile = low + (rank - math.floor(rank)) * (high - low)
         least, most = (_LEAST_G * self.gravity_mps2) ** 2, (_MOST_G * self.gravity_mps2) ** 2
         noise = min(quartile / _chi_squared(normal_quantile(0.25), self.freedom), most) + least
-        allowed = SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
-        return _VARIANCE_MARGIN * _chi_squared(5.0, self.freedom) * noise, allowed
+        return _VARIANCE_MARGIN * _chi_squared(5.0, self.freedom) * noise, SIGMAS * math.sqrt(noise / count)
 
 
 def _chi_squared(normal: float, freedom: int) -> float:

@@ -266,17 +266,20 @@ def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: flo
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
     begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
     free_attitude.refuse_poses(begun.linearised, noise)
-    settled = _settled(begun)
+    settled = _settled(begun, must_settle=False)  # axes that are not square may let it swing between two places
     untold = free_attitude.untold_angles(settled.linearised, noise)
-    if untold != bare.square:
+    if untold == bare.square:
+        settled = _settled(settled)
+    else:
         bare = Model(bench, square=untold)
         settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
     sigmas = free_attitude.square_sigmas(bare, settled.linearised.state)
     return settled if sigmas is None else replace(settled, noise=noise.with_terms(SquareAxes(sigmas)))
 
 
-def _settled(fitted: Fit) -> Fit:
-    """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
+def _settled(fitted: Fit, must_settle: bool = True) -> Fit:
+    """Return the fit of the nine parameters with forces and state found in turn until neither moves; must_settle:
+    whether it is an error if they move for ever."""
     for _ in range(MOST_STEPS):
         state = fitted.state
         if not _sensible(state, fitted.linearised.model):
@@ -284,6 +287,9 @@ def _settled(fitted: Fit) -> Fit:
         left = _left_to_settle(fitted, state)
         fitted = replace(fitted, linearised=_moved_to(fitted, fitted.linearised.model, state))
         if left < SETTLED:
+            return fitted
+    else:
+        if not must_settle:
             return fitted
     raise UnobservableError(_not_sensible(fitted.linearised.model))
 
