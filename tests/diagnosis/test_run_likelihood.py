@@ -161,7 +161,7 @@ def test_courses_are_those_of_the_likeliest_states_wherever_a_fit_has_stopped(po
     2400 nats. With further noise, beside two columns of 100 sigma and more, against numpy's lstsq."""
     before = Refits().with_effects(posterior._before, ("bias-drift",))
     fitted, model = before.linearised, before.model
-    stopped = LinearisedDwells(fitted.dwells, model, fitted.state + np.append(np.zeros(12), [3e-4, -2e-4, 1e-4]))
+    stopped = LinearisedDwells(fitted.dwells, model, fitted.state + np.append(np.zeros(12), [3e-2, -2e-2, 1e-2]))
     places, coefficients = np.arange(2), np.array([2e-4, -1e-4])
     effects = [effect_named("second-order", model.bench)]
     likelihood = RunLikelihood(stopped, posterior._noise, 1e-12, effects)
