@@ -136,9 +136,9 @@ class RunLikelihood:
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
+        shape = len(dwells), 3, count
         # the log of a Bayes factor errs by as much as rounding changes chi-squared
         is_rough = float(np.sum(z**2)) * np.finfo(np.float32).eps < _EXACT
-        shape = len(dwells), 3, count
         columns: Floats | Singles = np.empty(shape, np.float32) if is_rough else np.empty(shape)
         # chi-squared of the means beyond its expectation, and no less than noise makes of it
         explained = max(float(np.sum(z**2)) - z.size, 0.0) + 3.0 * math.sqrt(2.0 * z.size)
@@ -268,7 +268,9 @@ def _squares(columns: Floats | Singles) -> Floats:
 
 
 def of_unit_size(shapes: Floats) -> Floats:
-    """Return covariances (D, 3, 3) scaled to the noise that was stated."""
+    """Return covariances (D, 3, 3) scaled to the noise that was stated; by rounding none is negative."""
+    values, vectors = np.linalg.eigh(shapes)
+    shapes = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
     return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
 
 
@@ -378,7 +380,7 @@ def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: F
 
       1/2 (z^T (I - V^-1) z + h^T M^-1 h - |B^T z|^2) - 1/2 log det V - 1/2 log det M,
 
-    so that for each size there is a matrix of f rows only.
+    so that for each size there is a matrix of f rows only. What of B lies in U is known to the root of ``ROUNDING``.
     """
     common = np.swapaxes(turns, -1, -2) @ explained
     apart, axes = np.linalg.eigh(np.eye(common.shape[-1]) - np.swapaxes(common, -1, -2) @ common)
@@ -386,7 +388,7 @@ def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: F
     left = 1.0 / (1.0 + squares[..., None] * squared[..., None, :])
     pairs = (common[..., None] * common[..., None, :]).reshape(*common.shape[:-1], common.shape[-1] ** 2)
     matrices = (left @ pairs).reshape(*left.shape[:-1], *axes.shape[-2:])
-    matrices += (np.maximum(apart, 0.0)[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
+    matrices += (np.maximum(apart, math.sqrt(ROUNDING))[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
     of_rest = readings - (along[..., None, :] @ common)[..., 0, :]
     right = of_rest[..., None, :] + left @ (common * along[..., None])
     roots = np.linalg.cholesky(matrices)
