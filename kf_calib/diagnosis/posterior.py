@@ -82,14 +82,11 @@ class RunPosterior:
 
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
         self._refits, self._before, self._test = refits, before, test
-        model = before.model
         self._noise = before.noise.without_estimates().without(RandomWalk)
         misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test, self._with_constants())
-        measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
-        spare = measured - model.count + len(model.fixed)
-        self._sizes = NoiseSizes(self._run.likelihood, self._noise, spare, self._turns())
+        self._sizes = NoiseSizes(self._run.likelihood, self._noise, before.consistency.dof, self._turns())
         self._refused = set[str]()
         self._of_refits = dict[tuple[str, ...], tuple[RunLikelihood, Floats, Floats, Floats]]()
 
