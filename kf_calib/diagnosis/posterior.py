@@ -312,7 +312,7 @@ class RunPosterior:
         against these."""
         likelihood, logs, grams, along = self._in_noises_of(refit)
         k = int(np.argmax(logs + _gains(grams, along)))
-        likeliest = np.linalg.pinv(grams[k], ROUNDING, hermitian=True) @ along[k]
+        likeliest = _likeliest(grams[k], along[k])
         places = np.arange(len(likeliest))
         known = likelihood.states_beside(self._sizes.covariances[k], places, likeliest)
         courses = likelihood.courses_at(np.append(known, likeliest))
@@ -653,8 +653,15 @@ def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[
 
 def _gains(gram: Floats, along: Floats) -> Floats:
     """Return by how much (k,) columns raise the log likelihood at its best: gram (k, q, q), along (k, q)."""
-    inverse = np.linalg.pinv(gram, ROUNDING, hermitian=True)
-    return np.asarray(0.5 * np.einsum("kq,kqp,kp->k", along, inverse, along), float)
+    return 0.5 * np.sum(along * _likeliest(gram, along), axis=-1)
+
+
+def _likeliest(gram: Floats, along: Floats) -> Floats:
+    """Return the coefficients (..., q) of columns that are likeliest, whatever the lengths of these: gram
+    (..., q, q), along (..., q); what is rounding has none."""
+    scales = 1.0 / np.sqrt(np.maximum(np.einsum("...qq->...q", gram), 1e-300))
+    inverse = np.linalg.pinv(scales[..., None] * gram * scales[..., None, :], ROUNDING, hermitian=True)
+    return np.asarray(scales * (inverse @ (scales * along)[..., None])[..., 0], float)
 
 
 def _relations(effect: Effect) -> list[tuple[float, Floats]]:

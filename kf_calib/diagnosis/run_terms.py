@@ -47,6 +47,7 @@ _LEAST = 1e-3  # share of the largest part of a term that a part of it has at le
 _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, one a dwell, and of what is smooth
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
+_SETTINGS = 3.0  # setting errors, as share of a column, by which it is left of the model and is still not seen
 _WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
@@ -133,6 +134,9 @@ class RunTerms:
         rms = self.likelihood.lengths / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
         self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
+        # a column that the model has but for setting errors shows these, and nothing of a term
+        setting_rad = before.noise.setting.size_rad
+        self._least_share = max(SEEN, _SETTINGS * setting_rad if math.isfinite(setting_rad) else 0.0)
         self.terms = [*self._of_bearers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
         self._decompositions = dict[tuple[InNoises, int, int], tuple[Floats, Floats, Floats]]()
@@ -259,7 +263,7 @@ class RunTerms:
                 ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
             columns = self.likelihood.columns(draft.columns)
-            if not (np.linalg.norm(columns, axis=0) > SEEN * raw[draft.columns]).any():
+            if not (np.linalg.norm(columns, axis=0) > self._least_share * raw[draft.columns]).any():
                 continue
             if not (draft.is_known or len(draft.summands) == 1):
                 scaled = columns if draft.scales is None else columns * draft.scales
@@ -291,7 +295,7 @@ class RunTerms:
                     yield replace(term, log_share=log + math.log(0.5))
                     scales = ratios[places[0]] * term.scales
                     yield replace(term, log_share=log + math.log(0.5 * _RATIO), scales=scales)
-                elif (lengths[places] > SEEN * raw[places]).any():
+                elif (lengths[places] > self._least_share * raw[places]).any():
                     scales = None if term.scales is None else term.scales[only]
                     part = replace(term, columns=places, log_share=log, only=only, scales=scales)
                     least = 1.0 / lengths[places].max()

@@ -23,6 +23,7 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.run_likelihood import RunLikelihood
+from kf_calib.diagnosis.run_terms import RunTerms
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.diagnosis.unknown_terms import RETURNING
 from kf_calib.estimation.calibration import calibrate
@@ -537,6 +538,23 @@ def test_what_no_pose_of_one_gimbal_shows_takes_no_freedom(seed: int) -> None:
     assert in_it.spanned.log < beside.spanned.log + 0.5
     found = diagnose(before, replicate=False)
     assert not (found.sure and "base-tilt-drift" in found.missing), found.verdict
+
+
+@pytest.mark.parametrize("seed", [2, *slow(*range(3, 8))])
+def test_what_the_model_has_but_for_setting_errors_is_no_function_of_the_angle(seed: int) -> None:
+    """The force of one gimbal has sin(q1) whole, but for the errors by which the poses were corrected: these explained
+    scatter, beside a walk (99.5 %) for 1/f noise, with ten metres a second squared."""
+    noise = TrueNoise(white_mps2=1.5e-4, flicker_mps2=4e-5, scatter_mps2=5.4e-4)
+    angles = np.random.default_rng(seed).choice([0.0, 90.0, 180.0, 270.0, 45.0, -30.0, 110.0, -130.0], 40)
+    plan = [PlannedVisit((float(angle),), 20.0) for angle in angles]
+    sensors, options = GRADES["paper"].sensors(seed), {"sample_hz": 100.0, "angle_hz": 20.0, "slew_rate_degps": 90.0}
+    before = calibrate(Simulation(Bench(axes_of("x"), 9.81), sensors, noise, plan, seed=seed, **options))
+    terms = RunTerms(before, before.noise.without_estimates(), 1e-9, assess_candidates(before.fit))
+    number = next(k for k, term in enumerate(terms.unknown) if term.driver == "angle of gimbal 1")
+    summand = terms.unknown[number].summands.index(("sin(q1)", "cos(q1)"))
+    assert not [term for term in terms.terms if term.row == f"?{number}" and term.summands == (summand,)]
+    found = diagnose(before, replicate=False)
+    assert not (found.sure and {*found.missing} - {"bias-walk"}), found.verdict
 
 
 @pytest.mark.parametrize(("hidden", "seed"), [("base-tilt=60sigma", 3), *slow(

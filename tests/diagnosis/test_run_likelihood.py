@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
-from kf_calib.diagnosis.posterior import RunPosterior
+from kf_calib.diagnosis.posterior import RunPosterior, _gains, _likeliest
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import (
     RunLikelihood,
@@ -270,3 +270,16 @@ def test_columns_that_others_have_whole_explain_nothing_beside_them() -> None:
     spreads = 1.0 + squares[0][:, None] * np.where(sizes > 1e-5, sizes, 0.0) ** 2
     expected = 0.5 * np.sum((turned.T @ rest) ** 2 * (1.0 - 1.0 / spreads) - np.log(spreads), axis=1)
     assert float(found[0, 0]) == pytest.approx(np.logaddexp.reduce(expected + logs[0]), rel=0.02)
+
+
+def test_columns_of_any_length_are_as_likely_together_as_apart() -> None:
+    """A warm-up of 40 and a drift of 4e6 in length: with what one unit had, half of what they gain was lost, and what
+    they then left within dwells counted as if it changed irregularly (99.5 %)."""
+    rng = np.random.default_rng(4)
+    columns, z = rng.normal(size=(50, 4)) * np.array([40.0, 4e6, 1.0, 4e6]), 30.0 * rng.normal(size=50)
+    columns = np.hstack([columns, columns[:, :1]])  # one of them twice
+    gram, along = columns.T @ columns, columns.T @ z
+    basis = np.linalg.qr(columns[:, :4])[0]
+    best = z - basis @ (basis.T @ z)
+    np.testing.assert_allclose(z - columns @ _likeliest(gram, along), best, atol=1e-5)
+    assert _gains(gram[None], along[None])[0] == pytest.approx(0.5 * (z @ z - best @ best))
