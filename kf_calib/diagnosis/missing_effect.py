@@ -142,8 +142,8 @@ def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests
     refit = refits.with_effects(before, (test.lines.oscillation,))
     # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
     whole = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]])
-    share = whole / np.linalg.norm(test.lines.significant[0].amplitude_mps2)
-    return test if share > 0.5 and _leaves_noise(refit, before) else test.without_lines
+    seen = np.linalg.norm(test.lines.significant[0].amplitude_mps2)
+    return test if whole > 0.5 * seen and _leaves_noise(refit, before) else test.without_lines
 
 
 def _leaves_noise(refit: Calibration, before: Calibration) -> bool:
