@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from helpers.stored_numbers import UNTOLD
+from kf_calib.diagnosis.hypothesis_table import Hypothesis
 from kf_calib.effects.effect import Effect
 from kf_calib.errors import KfCalibError
 
@@ -57,7 +59,8 @@ class ResultNumbers:
                     self.add(part, name)
             case Sequence() | Set():
                 for part in sorted(thing, key=repr) if isinstance(thing, Set) else thing:
-                    self.add(part, name)
+                    if not (isinstance(part, Hypothesis) and part.probability < UNTOLD):  # rounding orders these
+                        self.add(part, name)
         self._add_parts(thing)
         return self
 

@@ -21,7 +21,8 @@ FOLDER = ROOT / "tests" / "golden" / "numbers"
 RENEW = "python tools/golden_numbers.py"
 _RELATIVE, _OF_SIGMA = 1e-5, 1e-4
 _ZERO = 1e-12
-_UNTOLD = 1e-3
+UNTOLD = 1e-3
+"""Probability below which no verdict tells an explanation: the order of such is one of rounding."""
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z][\w:=^*().+-]{0,40}( [\w:=^*().+-]+){0,2}")
 _NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?")
@@ -74,7 +75,7 @@ def plain(tree: Any) -> Any:
 
 def _is_untold(part: Any) -> bool:
     """Whether it is an explanation so unlikely that no verdict tells it: the order of such is one of rounding."""
-    return isinstance(part, Mapping) and "log10_odds_to_next" in part and part.get("probability", 1.0) < _UNTOLD
+    return isinstance(part, Mapping) and "log10_odds_to_next" in part and part.get("probability", 1.0) < UNTOLD
 
 
 def read(name: str) -> Any:
