@@ -314,8 +314,8 @@ class RunPosterior:
         k = int(np.argmax(logs + _gains(grams, along)))
         likeliest = _likeliest(grams[k], along[k])
         places = np.arange(len(likeliest))
-        known = likelihood.states_beside(self._sizes.covariances[k], places, likeliest)
-        courses = likelihood.courses_at(np.append(known, likeliest))
+        states = likelihood.states_beside(self._sizes.covariances[k], places, likeliest)
+        courses = likelihood.courses_at(states, likeliest)
         return likelihood.spanned.beside(places, likelihood.lengths), courses
 
     def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:

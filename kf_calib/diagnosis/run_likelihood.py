@@ -46,7 +46,7 @@ _FACTORS = 8  # of which a product is a double, whatever the sizes
 
 _ANY = Prior(misalignment_rad=math.pi, scale=10.0, bias_mps2=100.0)
 _EXACT = 0.01  # to which log likelihoods are known
-_NONE = np.zeros(0)
+_NONE, _NO_PLACES = np.zeros(0), np.zeros(0, np.intp)
 
 Combination = tuple[slice, Floats | None]
 """Columns, and the matrix by which they are combined; None: as they are."""
@@ -111,7 +111,7 @@ class RunLikelihood:
         z = (self._root @ readings[..., None])[..., 0]
         whitened = self._root @ design
         columns, within = self._made(effects, known, blocks, z, spanned(whitened.reshape(z.size, -1).copy())[0])
-        self.courses, (of_model, more, more_z) = within.courses, within.rows()
+        self._courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(of_prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(of_prior) :])
         self.lengths = np.sqrt(_squares(columns) + np.einsum("rc,rc->c", combined, combined))
@@ -157,8 +157,9 @@ class RunLikelihood:
         return columns, within
 
     def states_beside(self, covariances: Floats | None, places: Indices, coefficients: Floats) -> Floats:
-        """The known states of the model (p,) as they are likeliest beside coefficients (q,) of some columns, with
-        further noise, (D, 3, 3) in units of that stated: the fit may not have come to its end, or be of other noise."""
+        """The known states of the model, and what noise is that dwells share (known + shared,), as they are likeliest
+        beside coefficients (q,) of some columns, with further noise, (D, 3, 3) in units of that stated: the fit may not
+        have come to its end, or be of other noise."""
         rows = self.spanned
         left = rows.readings - rows.columns[..., places] @ coefficients
         parts = [rows.basis, left[..., None]]
@@ -167,14 +168,28 @@ class RunLikelihood:
         more = [rows.more_basis, (rows.more_readings - rows.more_columns[:, places] @ coefficients)[:, None]]
         basis, z = (np.vstack([p.reshape(-1, p.shape[2]), m]) for p, m in zip(parts, more, strict=True))
         along = np.linalg.lstsq(basis, z[:, 0])[0] + self._along - self._onto[:, places] @ coefficients
-        return self.linearised.state[: self._known] + (self._to_states @ along)[: self._known]
+        states = self._to_states @ along
+        states[: self._known] += self.linearised.state[: self._known]
+        return states
 
-    def courses_at(self, state: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE) -> Courses:
-        """What the model leaves at some state (p,) of the courses of the readings within dwells, with effects of some
-        coefficients (C,) that are not in it."""
+    @cached_property
+    def courses(self) -> Courses:
+        """What the model, and noise that dwells share, leave of the courses of the readings within dwells."""
+        shared, state = self._states > self._known, self.linearised.state
+        return (
+            self.courses_at(self.states_beside(None, _NO_PLACES, _NONE), state[self._known :])
+            if shared
+            else self._courses
+        )
+
+    def courses_at(self, states: Floats, terms: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE
+                   ) -> Courses:  # fmt: skip
+        """What is left of the courses of the readings within dwells at some states, as ``states_beside`` has them, of
+        terms of the model that have no flat prior, and with effects of some coefficients (C,) that are not in it."""
         linearised, dwells = self.linearised, self.linearised.dwells_at_state
         bench, values = linearised.model.bench, of_all_pieces(linearised.columns)
-        within, at = WithinRows(self.noise, linearised, self._known, np.append(state, 1.0)), linearised.state
+        about, at = np.concatenate([states[: self._known], terms, [1.0]]), linearised.state
+        within = WithinRows(self.noise, linearised, self._known, about, shared=states[self._known :])
         for _, some, pieces, nodes in few_at_a_time(dwells, stimulus_of(dwells, bench, at), len(coefficients)):
             added = candidate_columns(some, effects, bench, at, nodes).values @ coefficients
             within.add(some, values[pieces], added[..., None], pieces)

@@ -233,8 +233,8 @@ class RunTerms:
         effects = self._effects_of(term)
         coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
         coefficients[term.only] = likeliest * scales * self.likelihood.scales[term.columns]
-        state = self.likelihood.states_beside(covariance, term.columns, likeliest * scales)
-        return self.likelihood.courses_at(state, effects, coefficients)
+        states = self.likelihood.states_beside(covariance, term.columns, likeliest * scales)
+        return self.likelihood.courses_at(states, np.zeros(0), effects, coefficients)
 
     def _effects_of(self, term: RunTerm) -> list[Effect]:
         """Return the effects that make the columns of an unknown function, or of a random walk."""

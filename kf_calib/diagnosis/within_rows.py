@@ -74,12 +74,14 @@ class WithinRows:
 
     noise: what was stated. linearised: the dwells with the columns of the model, of which the first ``known`` have a
     flat prior. about (p + made,): the state of the model, and coefficients of the columns of effects. explained: by how
-    much these lower chi-squared of the means at most.
+    much these lower chi-squared of the means at most. shared: what noise that dwells share is taken to be, zeros if
+    nothing is given.
     """
 
     def __init__(
-        self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats, explained: float = math.inf
-    ) -> None:
+        self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats, explained: float = math.inf,
+        shared: Floats | None = None,
+    ) -> None:  # fmt: skip
         self._model, self._state, self._known = linearised.model, linearised.state, known
         self._made = len(about) - self._model.count
         judging = noise.with_scatter_as_flicker(len(linearised.dwells)).without(RandomWalk)
@@ -87,7 +89,10 @@ class WithinRows:
         without_means = judging if noise.attitude_unknown else judging.without(SettingError)
         self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
         self._channels = 1 if noise.attitude_unknown else 3
-        self._about = np.append(about, np.zeros(self._shared.shape[3]))
+        self._about = np.append(about, np.zeros(self._shared.shape[3]) if shared is None else shared)
+        of_effects = np.arange(len(self._about)) >= known
+        of_effects[len(about) :] = False
+        self._of_effects = np.where(of_effects, self._about, 0.0)
         self._largest, self._unseen = np.zeros(len(self._about)), np.zeros(len(self._about) + 1)
         self._share = _UNSEEN / explained
         self._gathered = list[tuple[Floats, Indices]]()
@@ -124,7 +129,7 @@ class WithinRows:
         self.log += log_of_errors(dwells, self._noise, self._state)
         of_dwells = whiten(dwells, columns, self._noise, self._state, self._about[moving], reduced=False)
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
-        made = np.where(np.arange(len(moving)) < self._known, 0.0, self._about)[moving]
+        made = self._of_effects[moving]
         pairs = [(rows[:, -1], rows[:, -1 - len(made) : -1] @ made) for rows in of_dwells]
         products = np.array([(left @ left, left @ course, course @ course) for left, course in pairs]).T
         self._courses.append(np.stack([products[0], np.asarray(freedom, float), *products[1:]]))

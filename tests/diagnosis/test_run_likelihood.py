@@ -180,7 +180,9 @@ def test_courses_are_those_of_the_likeliest_states_wherever_a_fit_has_stopped(po
     assert np.abs((found - before.fit.state) / sigma).max() > 50.0
     np.testing.assert_allclose((found - expected) / sigma, 0.0, atol=0.3)  # rows within dwells tell a little
     none = np.zeros(0, np.intp), np.zeros(0)
-    here, there = likelihood.courses_at(likelihood.states_beside(None, *none)), likelihood.courses_at(before.fit.state)
+    here, there = (
+        likelihood.courses_at(state, np.zeros(0)) for state in (likelihood.states_beside(None, *none), before.fit.state)
+    )
     np.testing.assert_allclose(here.squares, there.squares, rtol=0.02)
     assert likelihood.courses.squares.sum() > 10.0 * here.squares.sum()
 
