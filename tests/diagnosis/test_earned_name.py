@@ -66,7 +66,8 @@ def test_a_name_is_not_earned_where_nothing_missing_is_likelier(nothing: float, 
 )
 def test_what_is_named_in_a_real_recording_is_seen_in_it(name: str) -> None:
     diagnosis = diagnose(kf_calib.open_log(REAL / f"{name}.csv.gz", {"gravity_mps2": "9.80665"}, angles=False))
-    for effect in diagnosis.missing:
+    likelier_than_not = diagnosis.table is not None and diagnosis.table.probability(diagnosis.missing) > 0.5
+    for effect in diagnosis.missing if likelier_than_not else ():  # limits.md: of one, a drift of 0.9 sigma has 40 %
         assert diagnosis.after is not None
         if effect == walk_named(diagnosis.before.bench):
             continue
