@@ -195,7 +195,7 @@ CEILINGS = {
     "noise": 3406,
     "estimation": 7899,
     "design": 1879,
-    "diagnosis": 6162,
+    "diagnosis": 6157,
     "online": 1631,
     "exchange": 1962,
     "views": 6907,

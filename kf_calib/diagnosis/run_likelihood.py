@@ -175,12 +175,9 @@ class RunLikelihood:
     @cached_property
     def courses(self) -> Courses:
         """What the model, and noise that dwells share, leave of the courses of the readings within dwells."""
-        shared, state = self._states > self._known, self.linearised.state
-        return (
-            self.courses_at(self.states_beside(None, _NO_PLACES, _NONE), state[self._known :])
-            if shared
-            else self._courses
-        )
+        if self._states == self._known:
+            return self._courses
+        return self.courses_at(self.states_beside(None, _NO_PLACES, _NONE), self.linearised.state[self._known :])
 
     def courses_at(self, states: Floats, terms: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE
                    ) -> Courses:  # fmt: skip

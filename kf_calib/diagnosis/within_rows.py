@@ -90,9 +90,7 @@ class WithinRows:
         self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
         self._channels = 1 if noise.attitude_unknown else 3
         self._about = np.append(about, np.zeros(self._shared.shape[3]) if shared is None else shared)
-        of_effects = np.arange(len(self._about)) >= known
-        of_effects[len(about) :] = False
-        self._of_effects = np.where(of_effects, self._about, 0.0)
+        self._of_effects = np.concatenate([np.zeros(known), about[known:], np.zeros(self._shared.shape[3])])
         self._largest, self._unseen = np.zeros(len(self._about)), np.zeros(len(self._about) + 1)
         self._share = _UNSEEN / explained
         self._gathered = list[tuple[Floats, Indices]]()
