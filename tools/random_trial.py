@@ -120,15 +120,20 @@ def _diagnosed(run: RandomRun) -> tuple[str, str]:
     if found.test.consistent and large:
         return "overlooked", found.verdict
     if found.missing and table is not None and table.probability(found.missing) >= SURE:
-        wrong = {*found.missing} - run.names - {*table.same}
+        wrong = {*map(_kind, found.missing)} - run.names - {*map(_kind, table.same)}
         return ("wrong name" if wrong else "right name"), found.verdict
     return ("unknown" if found.unknown else "agrees" if found.test.consistent else "not sure"), found.verdict
+
+
+def _kind(name: str) -> str:
+    """Return the name of an effect without the gimbal that has it."""
+    return name.partition(":")[0]
 
 
 def _improved(run: RandomRun) -> tuple[str, str]:
     """Return how an improvement ended, and its reason."""
     state = improve(run.source)
-    added = {str(step.name) for step in state.steps}
+    added = {_kind(str(step.name)) for step in state.steps}
     wrong = added - run.names
     return (f"added {', '.join(sorted(wrong))}" if wrong else state.because), state.reason
 

@@ -238,7 +238,7 @@ class RunPosterior:
 
     def _row_of(self, names: Sequence[str], log: float) -> Hypothesis:
         """Return the row of some effects and, alone or beside one, an unknown function, with its prior."""
-        effects = tuple(name for name in names if not name.startswith("?"))
+        effects = tuple(each for name in names if not name.startswith("?") for each in self._run.effects_of(name))
         unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
         families = [self._effects[name].family for name in effects]
         families += [term.family or NONE for term in unknown]
@@ -255,12 +255,13 @@ class RunPosterior:
 
     def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
         """Return the log of the prior probability of some effects and, if so, an unknown function."""
-        names, unknown = max(len(self._run.names), 2), len(self._run.unknown)
+        causes, unknown = max(self._run.causes, 2), len(self._run.unknown)
         prior = math.prod(self._effects[name].prior for name in effects)
         if beside_unknown:
-            kind, among = ("beside", names * unknown) if effects else ("unknown", unknown)
+            kind, among = ("beside", causes * unknown) if effects else ("unknown", unknown)
         else:
-            kind, among = ("effect", names) if len(effects) == 1 else ("pair", math.comb(names, 2))
+            is_one = len(self._run.causes_of(effects)) == 1
+            kind, among = ("effect", causes) if is_one else ("pair", math.comb(causes, 2))
         return math.log(PRIOR[kind] * prior / among)
 
     def _tested(self, name: str) -> tuple[float, int]:
@@ -357,13 +358,19 @@ class RunPosterior:
                 pairs[(name,)] = self._of_two_summands(head, logs)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
-                if other != name and (is_known or not other.startswith("?")):
+                if self._is_pair(name, other) and (is_known or not other.startswith("?")):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}
         for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
             alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
         return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
+
+    def _is_pair(self, one: str, other: str) -> bool:
+        """Tell whether two rows together are another explanation: neither is of a gimbal that the other has, nor are
+        they all gimbals of one kind of error, which have a row of their own."""
+        both = {*self._run.effects_of(one)}, {*self._run.effects_of(other)}
+        return not both[0] & both[1] and len(self._run.causes_of([*set.union(*both)])) > 1
 
     def _summands_to_pair(self) -> list[int]:
         """Return the numbers of the likeliest summands of the unknown functions in which one is likeliest."""
@@ -456,11 +463,11 @@ class RunPosterior:
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
-        single = [row for row in effects if len(row.effects) == 1]
-        of_one = {row.effects[0]: row.log_evidence for row in single}
-        # a pair behind one of its own has nothing to add
-        alone = {id(row): max(map(of_one.__getitem__, row.effects)) for row in effects}
-        ahead = [row for row in effects if len(row.effects) == 1 or row.log_evidence > alone[id(row)]]
+        of_one = [row for row in effects if len(self._run.causes_of(row.effects)) == 1]
+        single = [row for row in of_one if len(row.effects) == 1]
+        # several behind one of their own have nothing to add
+        alone = {id(row): [one.log_evidence for one in of_one if {*one.effects} < {*row.effects}] for row in effects}
+        ahead = [row for row in effects if row.log_evidence > max(alone[id(row)], default=-math.inf)]
         single = [row for row in single if self._effects[row.effects[0]].scannable]
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
@@ -541,15 +548,20 @@ class RunPosterior:
         the fall of chi-squared by them in the likeliest noise."""
         likelihood, base, grams, along = self._in_noises_of(refit)
         effects, known = refit.model.effects[len(self._before.model.effects) :], self._before.model.count
-        starts = [refit.model.parts[str(effect)].start - known for effect in effects]
-        places = [start + np.arange(len(each.coefficients)) for start, each in zip(starts, effects, strict=True)]
+        named = {str(effect): effect for effect in effects}
+        causes = [[named[name] for name in names] for names in self._run.causes_of([*named])]
+        starts = {name: refit.model.parts[name].start - known for name in named}
+        places = [
+            np.concatenate([starts[str(effect)] + np.arange(len(effect.coefficients)) for effect in cause])
+            for cause in causes
+        ]
         every = np.concatenate(places)  # of these columns, without those of constants
         grams, along = grams[:, every][:, :, every], along[:, every]
-        related = [*itertools.product(*map(_relations, effects))]
-        usual = [usual_sizes(effect, self._run.grade) for effect in effects]
+        related = [*itertools.product(*map(_relations, causes))]
+        usual = [(usual_sizes(cause[0], self._run.grade), impossible_size(cause[0])) for cause in causes]
         sizes = [
-            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, impossible_size(effect), _NODES_OF_PAIR)
-             for place, (_, matrix), prior, effect in zip(places, relation, usual, effects, strict=True)]
+            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), *prior, _NODES_OF_PAIR)
+             for place, (_, matrix), prior in zip(places, relation, usual, strict=True)]
             for relation in related
         ]  # fmt: skip
         logs = list[Floats]()
@@ -664,8 +676,12 @@ def _likeliest(gram: Floats, along: Floats) -> Floats:
     return np.asarray(scales * (inverse @ (scales * along)[..., None])[..., 0], float)
 
 
-def _relations(effect: Effect) -> list[tuple[float, Floats]]:
-    """Return the matrices (q, k) that may combine the columns of an effect, with the logs of their shares."""
+def _relations(cause: Sequence[Effect]) -> list[tuple[float, Floats]]:
+    """Return the matrices (q, k) that may combine the columns of an effect, with the logs of their shares; of those
+    that several gimbals have together, all have their own."""
+    effect, *others = cause
+    if others:
+        return [(0.0, np.eye(sum(len(each.coefficients) for each in cause)))]
     matrices = [*effect.relations] or [np.eye(len(effect.coefficients))]
     some = of_bearers(effect.bearers)
     return [(log - math.log(len(matrices)), matrix[:, only]) for matrix in matrices for log, only in some]

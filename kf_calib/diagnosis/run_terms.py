@@ -28,7 +28,7 @@ from kf_calib.diagnosis.run_likelihood import (
 from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.diagnosis.within_rows import Courses, log_bayes_by_size
 from kf_calib.dwells.qr import orthonormal
-from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
+from kf_calib.effects import Coefficient, Effect, RotationEffect, Stimulus, effect_named, walk_named
 from kf_calib.effects.effect import Grade
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.candidate_scan import SEEN
@@ -139,6 +139,9 @@ class RunTerms:
         self._least_share = max(SEEN, _SETTINGS * setting_rad if math.isfinite(setting_rad) else 0.0)
         self.terms = [*self._of_bearers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
+        in_several = self._in_several_gimbals()
+        self._members = {term.row: names for term, names in in_several}
+        self.terms += [term for term, _ in in_several]
         self._decompositions = dict[tuple[InNoises, int, int], tuple[Floats, Floats, Floats]]()
 
     def _add_effects(self, columns: _Columns, test: CandidateTests, fitted: Sequence[tuple[Effect, float]]) -> None:
@@ -301,6 +304,38 @@ class RunTerms:
                     least = 1.0 / lengths[places].max()
                     if least < _most(part):
                         yield replace(part, sizes=self._sizes(part, least))
+
+    def _in_several_gimbals(self) -> list[tuple[RunTerm, tuple[str, ...]]]:
+        """Return, for each error that more than one gimbal shows, the term of them all: what makes one gimbal err makes
+        the others err, too, by as much. It comes with the names of the effects of which it has the columns."""
+        of_kind, lengths = dict[str, list[RunTerm]](), self.likelihood.lengths_left
+        for term in self.terms:
+            if term.is_known and isinstance(term.effect, RotationEffect) and term.effect.gimbal is not None:
+                of_kind.setdefault(term.effect.name, []).append(term)
+        found = list[tuple[RunTerm, tuple[str, ...]]]()
+        for name, each in of_kind.items():
+            longest = [float(lengths[term.columns].max()) for term in each]
+            each = [term for term, length in zip(each, longest, strict=True) if length > _LEAST * max(longest)]
+            if len(each) > 1:
+                term = replace(each[0], row=name, columns=np.concatenate([term.columns for term in each]))
+                sizes = self._sizes(term, 1.0 / max(longest))
+                found.append((replace(term, sizes=sizes), tuple(term.row for term in each)))
+        return found
+
+    def effects_of(self, row: str) -> tuple[str, ...]:
+        """The names of the effects that the known terms of a row have: one, or that of each gimbal."""
+        return self._members.get(row, (row,))
+
+    def causes_of(self, effects: Sequence[str]) -> list[tuple[str, ...]]:
+        """Effects, those that several gimbals have for one cause together."""
+        together = [names for names in self._members.values() if {*names} <= {*effects}]
+        alone = {*effects}.difference(*together)
+        return [*together, *((name,) for name in effects if name in alone)]
+
+    @property
+    def causes(self) -> int:
+        """The number of known causes: effects, and those that several gimbals have at once."""
+        return len(self.names) + len(self._members)
 
     def _ratios(self, places: Indices) -> Floats:
         """Return factors (q,) of the columns of three accelerometers: the size that is likeliest for each of them alone

@@ -22,7 +22,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.diagnosis.hypothesis_table import SURE
+from kf_calib.diagnosis.hypothesis_table import SURE, HypothesisTable
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
@@ -287,10 +287,12 @@ def improve(
     """
     start, refits = calibration_of(run, refits)
     state = begin(start, refits)
-    while (name := next_effect(state.diagnosis, accept_first)) is not None:
-        state = take_step(state, refits, name, None, "diagnosis")
-        if on_step is not None:
-            on_step(state)
+    while names := next_effects(state.diagnosis, accept_first):
+        table = state.diagnosis.table
+        for name in names:
+            state = take_step(state, refits, name, None if name == names[-1] else (), "diagnosis", table)
+            if on_step is not None:
+                on_step(state)
     return state
 
 
@@ -320,20 +322,22 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
     return replace(state, alternatives=tuple(alternatives))
 
 
-def next_effect(diagnosis: Diagnosis, accept_first: bool = False) -> str | None:
+def next_effects(diagnosis: Diagnosis, accept_first: bool = False) -> tuple[str, ...]:
     """The effect to add next: of those that are missing with 95 % probability, whether alone or with others, the one
-    that explains most.
+    that explains most; an error of a gimbal with that of the others, which they have for the same reason.
 
     None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
     if diagnosis.test.consistent is not False or not diagnosis.missing or diagnosis.table is None:
-        return None
+        return ()
     probabilities = {name: diagnosis.table.probability((name,)) for name in diagnosis.missing}
     sure = [name for name, probability in probabilities.items() if probability >= SURE]
     if not sure:
-        return max(probabilities, key=lambda name: probabilities[name]) if accept_first else None
+        return (max(probabilities, key=lambda name: probabilities[name]),) if accept_first else ()
     falls = {suspect.name: suspect.statistic for suspect in diagnosis.suspects}
-    return max(sure, key=lambda name: falls.get(name, 0.0))
+    first = max(sure, key=lambda name: falls.get(name, 0.0))
+    kind, colon, _ = first.partition(":")
+    return first, *(name for name in sure if colon and name != first and name.startswith(f"{kind}:"))
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:
@@ -349,13 +353,15 @@ def extend(state: Improvement, refits: Refits, names: Sequence[str], by: By) -> 
 
 
 def take_step(
-    state: Improvement, refits: Refits, added: str | None, dropped: Sequence[str] | None, by: By
-) -> Improvement:
+    state: Improvement, refits: Refits, added: str | None, dropped: Sequence[str] | None, by: By,
+    table: HypothesisTable | None = None,
+) -> Improvement:  # fmt: skip
     """The improvement after one step: ``added`` goes into the model, then effects are taken out.
 
     state: the improvement before. refits: those of the run. added: name or formula of an effect (None: no effect).
-    dropped: names of effects to take out (None: each that is not needed). by: who chose the step. Raises InputError
-    where the effect cannot be added, or where one to be dropped is not in the model.
+    dropped: names of effects to take out (None: each that is not needed). by: who chose the step. table: by which it
+    was chosen; None: that of the state. Raises InputError where the effect cannot be added, or where one to be dropped
+    is not in the model.
     """
     if added is not None:
         _refuse(state.result, added, can_read=refits.source is not None)
@@ -366,7 +372,7 @@ def take_step(
         both = zip(result.model.effects, result.settings.effects, strict=True)
         result = refits.of(result, tuple(text for effect, text in both if str(effect) != removal.name))
         removed.append(removal)
-    table = state.diagnosis.table
+    table = table or state.diagnosis.table
     probability = None if added is None or table is None else table.probability_of_added(added, _name(added, result))
     step = SelectionStep(added, tuple(removed), by, diagnose(result, refits), probability=probability)
     return _with_alternatives(replace(state, history=(*state.history, step)), refits)

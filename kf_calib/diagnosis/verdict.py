@@ -317,8 +317,11 @@ def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
 
 
 def _effects_of(row: Hypothesis) -> str:
-    """Return the effects of a row in words."""
-    return row.effects[0] if len(row.effects) == 1 else f"{listing(row.effects)} together"
+    """Return the effects of a row in words; of an error of several gimbals the name once."""
+    kinds = ["", *(name.partition(":")[0] for name in row.effects)]
+    names = [name.removeprefix(kind) if kind == before else name
+             for name, before, kind in zip(row.effects, kinds, kinds[1:], strict=False)]  # fmt: skip
+    return names[0] if len(names) == 1 else f"{listing(names)} together"
 
 
 def format_probability(probability: float) -> str:

@@ -14,12 +14,15 @@ from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.table import DwellTable
+from kf_calib.effects import RotationEffect
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, steps
 from kf_calib.noise.reml import Part, gain_of, misfit, with_shared_noise
 from kf_calib.noise.terms import RandomWalk, SlowWaves, WavesOverRun
+
+_LOST = 1e-6  # share of a combination of states, below which a coefficient has no part in it
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,8 +68,34 @@ class Fit:
 
     @cached_property
     def _solution(self) -> tuple[Floats, Floats, Floats]:
-        factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
-        return square_root_information.solve(factor, self.linearised.model.nominal_state())
+        return square_root_information.solve(self._factor, self.linearised.model.nominal_state())
+
+    @cached_property
+    def _factor(self) -> Floats:
+        return square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
+
+    @property
+    def redundant(self) -> list[str]:
+        """Symbols of coefficients of rotations that do nothing that others before them do not do, to first order: of
+        each combination of several that the readings do not determine, the last.
+
+        Beside each other they would be told by what is of second order in themselves alone, as the tilts of two axes
+        about a third one are: a fit would run far along what is hardly curved, and call certain what it finds there.
+        """
+        model = self.linearised.model
+        turning = [effect for effect in model.effects if isinstance(effect, RotationEffect)]
+        starts = [(model.parts[str(effect)].start, effect.coefficients) for effect in turning]
+        places = {start + k: each.symbol for start, those in starts for k, each in enumerate(those)}
+        if len(places) < 2:
+            return []
+        found, lost = list[str](), square_root_information.lost(self._factor)[list(places)]
+        for k, symbol in reversed([*enumerate(places.values())]):
+            length = float(np.linalg.norm(lost[k]))
+            along = lost @ lost[k] / max(length, ROUNDING)
+            if (np.abs(np.delete(along, k)) > _LOST).any():
+                lost = lost - np.outer(along, lost[k]) / length
+                found.append(symbol)
+        return found
 
     @cached_property
     def misfit_rows(self) -> Sequence[Floats]:

@@ -112,8 +112,7 @@ def fit(
         within = _within_again(fitted, within)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         still = (np.abs(constant_steps) <= SETTLED * reach).all() and not model.stepped
-        turning = fitted.noise.weights.setting_rad > 0.0
-        if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
+        if number >= _PASSES - 1 and still and left < SETTLED:
             return fitted
     if must_settle and not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
@@ -240,7 +239,12 @@ def _begun(
     if model.bench.angles:
         dwells = with_own_noise(dwells)
         within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(np.full(3, walk_mps2_per_sqrt_s)))
-        return Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
+        model = replace(model, held=frozenset())
+        begun = Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
+        if not (redundant := begun.redundant):
+            return begun
+        model = replace(model, held=frozenset(redundant))
+        return replace(begun, linearised=LinearisedDwells(begun.dwells, model, model.nominal_state(), slews))
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
     whole = replace(model, square=nine.linearised.model.square)
@@ -295,9 +299,8 @@ def _settled(fitted: Fit, must_settle: bool = True) -> Fit:
 
 
 def _left_to_settle(fitted: Fit, state: Floats) -> float:
-    """Return by how many sigmas the fit moves from its linearisation; 0 where no attitude moves with it."""
-    turning = fitted.noise.weights.setting_rad > 0.0
-    return left_to_settle(state, fitted.linearised.state, fitted.sigma_of_determined) if turning else 0.0
+    """Return by how many sigmas the fit moves from its linearisation."""
+    return left_to_settle(state, fitted.linearised.state, fitted.sigma_of_determined)
 
 
 def _moved_to(fitted: Fit, model: Model, state: Floats) -> LinearisedDwells:

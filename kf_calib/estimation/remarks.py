@@ -95,6 +95,12 @@ def remarks_on(
         )
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
+    if model.held:
+        held = [each.symbol for each in model.coefficients if each.symbol in model.held]
+        yield (
+            f"{listing(held)} {'are' if len(held) > 1 else 'is'} zero by convention: in these orientations other "
+            "coefficients do the same, and no reading tells them apart."
+        )
     for effect in model.effects:
         if effect.held and effect.unknown is not None:
             yield _on_held(effect, effect.unknown)

@@ -164,6 +164,12 @@ def ranks(factors: Floats, tolerance: float = ROUNDING) -> NDArray[np.intp]:
     return np.asarray((singular > tolerance).sum(axis=-1))
 
 
+def lost(factor: Floats) -> Floats:
+    """An orthonormal basis (p, q) of what R does not determine, of states in units of their columns' scales."""
+    _, singular, right = np.linalg.svd(scale_columns(factor)[0])
+    return np.asarray(right[singular <= ROUNDING].T)
+
+
 def solve(factor: Floats, around: Floats, tolerance: float = ROUNDING) -> tuple[Floats, Floats, Floats]:
     """State (p,), covariance (p, p) and a basis (p, q) of the combinations of states that are not determined.
 
