@@ -4,14 +4,17 @@ only while the platform turns: the time a reading was taken, and where each acce
 
 from __future__ import annotations
 
+import copy
 import re
 from abc import abstractmethod
+from collections.abc import Collection
+from typing import Self
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import PAIRS, Bearer, Effect, Regressor, Typical, interleaved, of_each
+from kf_calib.effects.effect import PAIRS, Bearer, Coefficient, Effect, Regressor, Typical, interleaved, of_each
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -25,10 +28,30 @@ class RotationEffect(Effect):
     reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
     has no columns.
     gimbal: number from 0 of the one whose angle is wrong; None of any other error, which may turn about any axis.
+    at_zero: symbols of coefficients that it does not have, as other effects of the model do the same (``without``).
     """
 
     borne_by = Bearer.BENCH
     gimbal: int | None = None
+    at_zero: frozenset[str] = frozenset()
+
+    def without(self, symbols: Collection[str]) -> Self:
+        """The same effect without those of its coefficients that have one of these symbols, and with all others; one
+        that a user gave coefficients of its own has all."""
+        if type(self).coefficients is not RotationEffect.coefficients:
+            return self
+        other = copy.copy(self)
+        other.at_zero = frozenset(symbols).intersection(self.symbols)
+        return other
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(each for each in super().coefficients if each.symbol not in self.at_zero)
+
+    def _rotations(self, s: Stimulus) -> Floats:
+        """Return the rotations (m, q, 3) of the coefficients that it has."""
+        kept = [k for k, symbol in enumerate(self.symbols) if symbol not in self.at_zero]
+        return self.rotations(s)[:, kept] if self.at_zero else self.rotations(s)
 
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)
@@ -43,7 +66,7 @@ class RotationEffect(Effect):
 
     def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
         """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
-        return np.einsum("mqx,q->mx", self.rotations(s), coefficients)
+        return np.einsum("mqx,q->mx", self._rotations(s), coefficients)
 
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         rho = self.turned_rad(s, coefficients)
@@ -51,7 +74,7 @@ class RotationEffect(Effect):
         return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
 
     def columns(self, s: Stimulus) -> Floats:
-        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self.rotations(s)))
+        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self._rotations(s)))
         turned = np.cross(rotations, s.force_mps2[:, None, :])
         return np.einsum("mqx,ix->miq", turned, s.sensitivity)
 

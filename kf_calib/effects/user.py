@@ -94,7 +94,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     if issubclass(kind, SensorEffect):
         missing += ["terms"] if kind.terms is SensorEffect.terms and not kind.formulas else []
-    elif kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
+    elif kind.coefficients in (Effect.coefficients, RotationEffect.coefficients) and not hasattr(kind, "symbols"):
         missing = ["coefficients", *missing]
     if missing:
         raise InputError(f"{who} lacks {listing(missing)}: define {'it' if len(missing) == 1 else 'them'}.")

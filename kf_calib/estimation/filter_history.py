@@ -84,8 +84,7 @@ def _shown(result: Calibration, estimate: Estimate) -> tuple[Floats, Floats]:
     """Return values and sigmas (p,) of an estimate, the states of unknown constants as these constants."""
     coefficients, gains = result.model.natural(estimate.state)
     values = np.append(estimate.parameters, coefficients)
-    is_held = [each.symbol in result.model.held for each in result.model.coefficients]
-    sigmas = np.append(estimate.sigma, np.where(is_held, np.nan, gains * estimate.effect_sigma))
+    sigmas = np.append(estimate.sigma, gains * estimate.effect_sigma)
     return np.where(np.isfinite(sigmas), values, np.nan), sigmas
 
 

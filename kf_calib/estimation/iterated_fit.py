@@ -12,7 +12,7 @@ derivative is averaged over its posterior.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
-from kf_calib.effects import Effect
+from kf_calib.effects import Effect, RotationEffect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import (
@@ -239,16 +239,22 @@ def _begun(
     if model.bench.angles:
         dwells = with_own_noise(dwells)
         within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(np.full(3, walk_mps2_per_sqrt_s)))
-        model = replace(model, held=frozenset())
-        begun = Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
+        whole = _without(model, ())
+        begun = Fit(LinearisedDwells(without_attitudes(dwells), whole, whole.nominal_state(), slews), within)
         if not (redundant := begun.redundant):
             return begun
-        model = replace(model, held=frozenset(redundant))
+        model = _without(whole, redundant)
         return replace(begun, linearised=LinearisedDwells(begun.dwells, model, model.nominal_state(), slews))
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
     whole = replace(model, square=nine.linearised.model.square)
     return Fit(LinearisedDwells(nine.dwells, whole, state), nine.noise, beginning=nine)
+
+
+def _without(model: Model, symbols: Collection[str]) -> Model:
+    """Return a model whose rotations have all coefficients but those of these symbols."""
+    without = (each.without(symbols) if isinstance(each, RotationEffect) else each for each in model.effects)
+    return replace(model, effects=tuple(without))
 
 
 def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:

@@ -43,8 +43,6 @@ class Model:
     """Without angles: the angles of ``SQUARE`` by which the input axes are taken for square to each other."""
     known: tuple[KnownEffect, ...] = ()
     """Effects whose coefficients are known, which the readings no longer contain (``without_known``)."""
-    held: frozenset[str] = frozenset()
-    """Symbols of coefficients of rotations that are zero by convention: others beside them do the same."""
 
     @classmethod
     def of(cls, bench: Bench, names: Iterable[str] = (), errors: BenchModel | None = None) -> Model:
@@ -173,17 +171,14 @@ class Model:
     def nominal_state(self) -> Floats:
         """The state (p,) at nominal parameters and without effects."""
         twelve = paper_parameters.state_of(paper_parameters.nominal(self.bench.nominal))
-        state = np.concatenate([twelve, np.zeros(len(self.coefficients))])
-        state[list(self.fixed)] = 0.0
-        return state
+        twelve[list(self.fixed)] = 0.0
+        return np.concatenate([twelve, np.zeros(len(self.coefficients))])
 
     @property
     def fixed(self) -> tuple[int, ...]:
         """The states that are zero by convention: those of the frame where no angles are used, and those by which axes
-        are taken for square; with angles, coefficients that are held."""
-        if not self.bench.angles:
-            return (*FRAME, *(SQUARE[angle] for angle in self.square))
-        return tuple(STATE_COUNT + k for k, each in enumerate(self.coefficients) if each.symbol in self.held)
+        are taken for square."""
+        return () if self.bench.angles else (*FRAME, *(SQUARE[angle] for angle in self.square))
 
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
         """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at

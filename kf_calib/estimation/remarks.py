@@ -11,7 +11,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells import window_average
-from kf_calib.effects import Effect, remarks_of
+from kf_calib.effects import Effect, RotationEffect, remarks_of
 from kf_calib.effects.effect import Coefficient, Unknown
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
@@ -95,11 +95,10 @@ def remarks_on(
         )
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
-    if model.held:
-        held = [each.symbol for each in model.coefficients if each.symbol in model.held]
+    if at_zero := [symbol for each in model.effects if isinstance(each, RotationEffect) for symbol in each.at_zero]:
         yield (
-            f"{listing(held)} {'are' if len(held) > 1 else 'is'} zero by convention: in these orientations other "
-            "coefficients do the same, and no reading tells them apart."
+            f"{listing(sorted(at_zero))} {'are' if len(at_zero) > 1 else 'is'} zero by convention: in these "
+            "orientations other coefficients do the same, and no reading tells them apart."
         )
     for effect in model.effects:
         if effect.held and effect.unknown is not None:

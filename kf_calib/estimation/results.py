@@ -278,12 +278,11 @@ class Calibration:
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             rows.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
             units.append((constant.shown_unit, constant.per_si))
-        conventional = {*self.fixed, *self.model.held}
         return Parameters(
             Parameter(
                 symbol,
-                float(value) if np.isfinite(sigma) and symbol not in conventional else None,
-                float(sigma) if np.isfinite(sigma) and symbol not in conventional else None,
+                float(value) if np.isfinite(sigma) and symbol not in self.fixed else None,
+                float(sigma) if np.isfinite(sigma) and symbol not in self.fixed else None,
                 unit,
                 float(expected),
                 *own,
@@ -330,8 +329,7 @@ class Calibration:
     def undetermined(self) -> tuple[str, ...]:
         """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine; those
         that are fixed are known."""
-        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)}
-        states -= {*self.fixed, *self.model.held}
+        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)} - set(self.fixed)
         return tuple(p.symbol for p in self.parameters.values() if p.symbol in states and p.sigma is None)
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:

@@ -170,8 +170,10 @@ class SavedCalibration(FilePart):
 def _at_constant(
     effect: effects.Effect, constant: float | None, origin: Path, symbols: Collection[str]
 ) -> effects.Effect:
-    """The effect with its constant, which a file states for effects that have one, and within their range; where it is
-    not among the ``symbols`` of the state, it was held."""
+    """The effect with its constant, which a file states for effects that have one, and within their range; what is not
+    among the ``symbols`` of the state was held, or is zero by convention."""
+    if isinstance(effect, effects.RotationEffect):
+        effect = effect.without({each.symbol for each in effect.coefficients}.difference(symbols))
     if constant is None and effect.unknown is None:
         return effect
     if constant is None or effect.unknown is None or effect.at(constant).value != constant:
