@@ -100,6 +100,10 @@ class Refits:
                     return again
             refitted = replace(evaluate_fit(fitted, settings), counts=before.counts, readings=before.readings)
             refuse_unseen(refitted)
+            for effect in fitted.linearised.model.effects:
+                if not (effect.states or effect.walks or effect.unknown):
+                    raise UnobservableError(f"{effect} does what others in the model do, in these orientations: leave "
+                                            "it out, or one of these.")  # fmt: skip
             return refitted
 
 

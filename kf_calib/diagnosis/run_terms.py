@@ -312,15 +312,15 @@ class RunTerms:
         for term in self.terms:
             if term.is_known and isinstance(term.effect, RotationEffect) and term.effect.gimbal is not None:
                 of_kind.setdefault(term.effect.name, []).append(term)
-        found = list[tuple[RunTerm, tuple[str, ...]]]()
+        in_several = list[tuple[RunTerm, tuple[str, ...]]]()
         for name, each in of_kind.items():
             longest = [float(lengths[term.columns].max()) for term in each]
-            each = [term for term, length in zip(each, longest, strict=True) if length > _LEAST * max(longest)]
-            if len(each) > 1:
-                term = replace(each[0], row=name, columns=np.concatenate([term.columns for term in each]))
-                sizes = self._sizes(term, 1.0 / max(longest))
-                found.append((replace(term, sizes=sizes), tuple(term.row for term in each)))
-        return found
+            seen = [term for term, length in zip(each, longest, strict=True) if length > _LEAST * max(longest)]
+            if len(seen) > 1:
+                term = replace(seen[0], row=name, columns=np.concatenate([term.columns for term in seen]))
+                term = replace(term, sizes=self._sizes(term, 1.0 / max(longest)))
+                in_several.append((term, tuple(term.row for term in seen)))
+        return in_several
 
     def effects_of(self, row: str) -> tuple[str, ...]:
         """The names of the effects that the known terms of a row have: one, or that of each gimbal."""

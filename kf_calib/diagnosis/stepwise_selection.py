@@ -403,7 +403,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
     rank, misfit, tests = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in linearised.model.effects:
-        if not effect.coefficients:  # a random walk is noise, which is judged by its likelihood
+        if effect.walks:  # it is noise, which is judged by its likelihood
             gain = 2.0 * fitted.walk_gain
             tests.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue

@@ -88,14 +88,14 @@ class Fit:
         places = {start + k: each.symbol for start, those in starts for k, each in enumerate(those)}
         if len(places) < 2:
             return []
-        found, lost = list[str](), square_root_information.lost(self._factor)[list(places)]
+        redundant, lost = list[str](), square_root_information.lost(self._factor)[list(places)]
         for k, symbol in reversed([*enumerate(places.values())]):
-            length = float(np.linalg.norm(lost[k]))
-            along = lost @ lost[k] / max(length, ROUNDING)
-            if (np.abs(np.delete(along, k)) > _LOST).any():
-                lost = lost - np.outer(along, lost[k]) / length
-                found.append(symbol)
-        return found
+            along = lost @ lost[k]  # what is lost and has the most of this coefficient
+            own = math.sqrt(along[k])
+            if own > _LOST and (np.abs(np.delete(along, k)) > _LOST * own).any():
+                lost = lost - np.outer(along, lost[k]) / along[k]
+                redundant.append(symbol)
+        return redundant
 
     @cached_property
     def misfit_rows(self) -> Sequence[Floats]:

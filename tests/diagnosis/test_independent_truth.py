@@ -53,6 +53,34 @@ def test_play_of_a_gimbal_is_no_error_of_its_encoder(gimbal: int, seed: int) -> 
     assert abs(found.value - play) < 4.0 * found.sigma < 0.3 * play
 
 
+def tilted(seed: int, size_rad: float = 0.5 * WITHIN_RAD) -> IndependentBench:
+    """A bench with no gimbal's axis where it should be."""
+    tilts = size_rad * np.random.default_rng([seed, 8]).normal(size=(3, 3)) * (1.0 - np.eye(3)[[1, 2, 0]])
+    return IndependentBench(seed, tilts_rad=tuple(map(tuple, tilts.tolist())))
+
+
+@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4, 5, 6)])
+def test_axes_of_all_gimbals_are_tilted(seed: int) -> None:
+    """As of any bench. It was told as the tilts of one axis and of the base, with 99 %; of the tilts of the other two
+    about the outer axis only the difference shows, so that one of them is zero by convention."""
+    diagnosis = diagnosed(tilted(seed))
+    assert {*diagnosis.missing} == {f"axis-nonorthogonality:{axis}" for axis in "yzx"}, diagnosis.verdict
+    after = diagnosis.after
+    assert diagnosis.sure and after is not None and after.consistency.p_value > 1e-4
+    assert ":y, :z and :x together" in diagnosis.verdict
+    assert any("zero by convention" in warning for warning in after.warnings)
+    bench, found = tilted(seed), after.parameters
+    true = {f"K{i + 1}": bench.scales[i] for i in range(3)} | {f"b{i + 1}": bench.biases_mps2[i] for i in range(3)}
+    assert all(abs(found[name].value - value) < 4.0 * found[name].sigma < 1e-5 for name, value in true.items())
+
+
+@pytest.mark.slow
+def test_what_several_gimbals_have_is_added_together() -> None:
+    state = kf_calib.improve(calibrate(tilted(1)))
+    assert {step.name for step in state.steps} == {f"axis-nonorthogonality:{axis}" for axis in "yzx"}
+    assert state.because == "consistent" and min(step.probability for step in state.steps) > 0.99
+
+
 SLIPS = {
     "a jump of the tilt of the base": {"base": [1.0, 0.0, -0.7]},
     "a jump of the mounting": {"mount": [0.6, 0.8, -0.5]},

@@ -42,7 +42,8 @@ def _none(state: State) -> np.ndarray:
 class IndependentBench:
     """A source. gimbals: errors of the angles (n, 3), rad; base, mount: rotation vectors (n, 3) of the base, in the
     bench, and of the block, in the platform; scale: share (n, 3) by which the readings are too large; bias:
-    what is added to them, m/s^2. pose_noise_rad: of each recorded angle, or of the attitude about each axis."""
+    what is added to them, m/s^2. pose_noise_rad: of each recorded angle, or of the attitude about each axis.
+    tilts_rad: rotation vectors by which the axis of each gimbal is turned in its parent."""
 
     seed: int
     dwells: int = 24
@@ -54,6 +55,7 @@ class IndependentBench:
     scale: Error = _none
     bias: Error = _none
     bench: Bench = BENCH
+    tilts_rad: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 3
     warnings: tuple[str, ...] = ()
 
     @cached_property
@@ -86,15 +88,27 @@ class IndependentBench:
         scales, biases = 1.0 + 3e-4 * rng.standard_normal(3), 2e-3 * rng.standard_normal(3)
         return axes / np.linalg.norm(axes, axis=1)[:, None], scales, biases
 
+    def _turned(self, angles_rad: np.ndarray) -> Rotation:
+        """The platform in the base: each gimbal turns the next about its axis as it is."""
+        nominal = np.eye(3)[[1, 2, 0]]
+        axes = [Rotation.from_rotvec(tilt).apply(axis) for tilt, axis in zip(self.tilts_rad, nominal, strict=True)]
+        outer, middle, inner = (Rotation.from_rotvec(angles_rad[:, [k]] * axis) for k, axis in enumerate(axes))
+        return outer * middle * inner
+
     @property
     def biases_mps2(self) -> np.ndarray:
         """The true biases (3,)."""
         return self._sensors(np.random.default_rng([self.seed, 1]))[2]
 
+    @property
+    def scales(self) -> np.ndarray:
+        """The true scale factors (3,)."""
+        return self._sensors(np.random.default_rng([self.seed, 1]))[1]
+
     def __iter__(self) -> Iterator[Batch]:
         state, rng = self.state, np.random.default_rng([self.seed, 1])
         axes, scales, biases = self._sensors(rng)
-        turned = Rotation.from_euler("YZX", state.angles_rad + self.gimbals(state))
+        turned = self._turned(state.angles_rad + self.gimbals(state))
         in_bench = Rotation.from_rotvec(self.base(state)) * turned * Rotation.from_rotvec(self.mount(state))
         along = in_bench.inv().apply([0.0, G, 0.0]) @ axes.T
         readings = (scales + self.scale(state)) * along + biases + self.bias(state)
