@@ -44,7 +44,7 @@ _FEW, _NODES_OF_FEW = 2, 20  # columns of which a step twice as long sums it to 
 _SAME = 0.999  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
-_FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, one a dwell, and of what is smooth
+_FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, two a dwell, and of what is smooth
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _SETTINGS = 3.0  # setting errors, as share of a column, by which it is left of the model and is still not seen
@@ -202,7 +202,7 @@ class RunTerms:
         spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
         w^2 tau^2 / (1 + w^2 tau^2), and that of 1/f noise is that of a walk times w."""
         dwells = self._linearised.dwells
-        run_s, count = dwells[-1].end_s, min(max(len(dwells), _FEWEST_WAVES), _WAVES)
+        run_s, count = dwells[-1].end_s, min(max(2 * len(dwells), _FEWEST_WAVES), _WAVES)
         walks = [_Walk(run_s, most, of_scale) for of_scale in (False, True) for most in (count, min(count, _SMOOTH))]
         of_bias, of_bias_smooth, of_scale, of_scale_smooth = (columns.block(columns.add([walk])) for walk in walks)
         self._path = walks[0]
