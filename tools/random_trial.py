@@ -3,7 +3,9 @@
 or not, and up to two effects. Only a refusal in a sentence may be raised. Names of 90 % or more not hidden, and
 large effects beside which a run agrees, are printed with their seed, by which any run is played again.
 
-usage: .venv/bin/python tools/random_trial.py [--runs 200] [--first 0] [--jobs 2] [--improve]
+``--usual``: in place of up to two effects each one there is, with a probability of 0.15 and a size that is usual.
+
+usage: .venv/bin/python tools/random_trial.py [--runs 200] [--first 0] [--jobs 2] [--improve] [--usual]
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import traceback
 import warnings
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,13 +31,15 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import KfCalibError
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.injected.kinds import catalogue
+from kf_calib.sources.simulation.injected.kinds import Hidden, catalogue
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation, without_angles
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
-NAMES = sorted(kind.name for kind in catalogue().values() if kind.known)
+KNOWN = {kind.name: kind for kind in catalogue().values() if kind.known}
+NAMES = sorted(KNOWN)
+PRESENT = 0.15  # probability of each effect where all there are may be present
 ANGLES_DEG = 0.0, 90.0, 180.0, 270.0, 45.0, -30.0
 SURE, LARGE = 0.9, 20.0  # probability of a name; sigma of an effect that should not be overlooked
 
@@ -54,7 +58,7 @@ class RandomRun:
         return {*self.hidden} | ({"bias-walk"} if "walk_mps2_per_sqrt_s" in self.noise else set[str]())
 
 
-def drawn(seed: int) -> RandomRun:
+def drawn(seed: int, usual: bool = False) -> RandomRun:
     """The run of a seed. Raises KfCalibError where it cannot be: an effect that these poses do not show."""
     rng = np.random.default_rng(seed)
     axes, grade = str(rng.choice(["yzx", "zx", "yz", "xz", "x", "zxy"])), str(rng.choice([*GRADES]))
@@ -69,12 +73,28 @@ def drawn(seed: int) -> RandomRun:
         slew_rate_degps=float(rng.choice([20, 90, np.inf])),
         ambient=Ambient(swing_c=float(rng.choice([0, 5])), period_s=300.0, sigma_c=float(rng.choice([0, 0.01]))),
     )  # fmt: skip
+    if usual:
+        hidden = _usual(rng, grade, bench)
+        return RandomRun(base.hiding(hidden), {each.kind.name: 0.0 for each in hidden}, noise)
     names = rng.choice(NAMES, size=int(rng.integers(3)), replace=False).tolist()
     hidden = {name: float(f"{10 ** rng.uniform(0.7, 3.0):.3g}") for name in names}
     by_hand = bool(rng.random() < 0.2)
     texts, seen = [f"{name}={size}sigma" for name, size in hidden.items()], without_angles(base) if by_hand else base
     run = base.hiding(parse(texts, bench.axes, seed=seed, grade=grade, sized=partial(sized, seen)))
     return RandomRun(run.by_hand() if by_hand else run, hidden, noise)
+
+
+def _usual(rng: np.random.Generator, grade: str, bench: Bench) -> list[Hidden]:
+    """Return some of all effects, of sizes that are usual in sensors of a grade, on all gimbals or accelerometers."""
+    hidden = list[Hidden]()
+    for name in (name for name in NAMES if rng.random() < PRESENT):
+        share, ends = rng.random(), getattr(KNOWN[name], grade if grade == "mems" else "navigation")
+        both = [parse([f"{name}={end}"], bench.axes, seed=0, grade=grade) for end in ends]
+        for low, high in zip(*both, strict=True):
+            sizes = [np.sign(a) * abs(a) ** (1.0 - share) * abs(b) ** share if a else b
+                     for a, b in zip(low.sizes, high.sizes, strict=True)]  # fmt: skip
+            hidden.append(replace(low, sizes=tuple(map(float, sizes))))
+    return hidden
 
 
 def _noise(rng: np.random.Generator) -> dict[str, float]:
@@ -100,12 +120,12 @@ def _plan(rng: np.random.Generator, gimbals: int) -> list[PlannedVisit]:
     return [PlannedVisit(tuple(pose), float(rng.choice(some_s))) for pose in poses]
 
 
-def played(improving: bool, seed: int) -> tuple[int, str, str]:
+def played(improving: bool, usual: bool, seed: int) -> tuple[int, str, str]:
     """The seed, how its run ended, and what was said."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            run = drawn(seed)
+            run = drawn(seed, usual)
             return (seed, *(_improved(run) if improving else _diagnosed(run)))
         except KfCalibError as error:
             return seed, "refused", str(error)
@@ -143,11 +163,12 @@ def _improved(run: RandomRun) -> tuple[str, str]:
 @click.option("--first", default=0, show_default=True, help="Seed of the first run.")
 @click.option("--jobs", default=2, show_default=True)
 @click.option("--improve", "improving", is_flag=True, help="Add what is missing, in place of one diagnosis.")
-def main(runs: int, first: int, jobs: int, improving: bool) -> None:
+@click.option("--usual", is_flag=True, help="Each effect with a probability of 0.15, of a usual size.")
+def main(runs: int, first: int, jobs: int, improving: bool, usual: bool) -> None:
     """Print each run that ended otherwise than it should, and how many ended how."""
     ends, usual = Counter[str](), {"refused", "right name", "unknown", "agrees", "not sure", "consistent", "ambiguous"}
     with ProcessPoolExecutor(jobs) as pool:
-        for seed, end, said in pool.map(partial(played, improving), range(first, first + runs)):
+        for seed, end, said in pool.map(partial(played, improving, usual), range(first, first + runs)):
             ends[end] += 1
             if end not in usual:
                 print(f"{seed}: {end}: {said}\n", flush=True)

@@ -50,8 +50,9 @@ class RotationEffect(Effect):
 
     def _rotations(self, s: Stimulus) -> Floats:
         """Return the rotations (m, q, 3) of the coefficients that it has."""
-        kept = [k for k, symbol in enumerate(self.symbols) if symbol not in self.at_zero]
-        return self.rotations(s)[:, kept] if self.at_zero else self.rotations(s)
+        if not self.at_zero:
+            return self.rotations(s)
+        return self.rotations(s)[:, [k for k, symbol in enumerate(self.symbols) if symbol not in self.at_zero]]
 
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)
