@@ -189,7 +189,7 @@ CEILINGS = {
     "kf_calib": 188,
     "support": 1105,
     "bench": 1714,
-    "effects": 3154,
+    "effects": 3155,
     "sources": 11956,
     "dwells": 3864,
     "noise": 3406,
