@@ -43,6 +43,7 @@ _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
 _ROUNDING = 1e-13  # of columns of a length of one: their prior may be as small beside what is known best
 _FACTORS = 8  # of which a product is a double, whatever the sizes
+_MANY = 8  # columns of an accelerometer, from which on it is worth looking whether those of the others are apart
 
 _ANY = Prior(misalignment_rad=math.pi, scale=10.0, bias_mps2=100.0)
 _EXACT = 0.01  # to which log likelihoods are known
@@ -343,8 +344,24 @@ def _eigen(gram: Floats, lengths: Floats | None) -> tuple[Floats, Floats, Floats
     largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
     scales = np.sqrt(np.maximum(largest, 1e-300))
     scaled = gram / scales[..., None, None] ** 2
-    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
+    values, vectors = _eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
     return scales, np.where(values > ROUNDING, values, 0.0), vectors
+
+
+def _eigh(gram: Floats) -> tuple[Floats, Floats]:
+    """Return eigenvalues (..., q) and vectors (..., q, q); of many columns that follow each other by accelerometer, as
+    of walks, of each alone where noise does not mix them, which takes a ninth of the time."""
+    third, left = divmod(gram.shape[-1], 3)
+    if left or third < _MANY:
+        return np.linalg.eigh(gram)
+    apart = np.moveaxis(gram.reshape(*gram.shape[:-2], 3, third, 3, third), -2, -3)  # (..., 3, 3, k, k)
+    if np.abs(apart[..., ~np.eye(3, dtype=bool), :, :]).max() > ROUNDING:
+        return np.linalg.eigh(gram)
+    values, own = np.linalg.eigh(np.stack([apart[..., i, i, :, :] for i in range(3)], axis=-3))
+    vectors = np.zeros((*gram.shape[:-2], 3, third, 3, third))
+    for i in range(3):
+        vectors[..., i, :, i, :] = own[..., i, :, :]
+    return values.reshape(*gram.shape[:-1]), vectors.reshape(gram.shape)
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,

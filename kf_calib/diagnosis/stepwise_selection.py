@@ -360,13 +360,14 @@ def take_step(
 
     state: the improvement before. refits: those of the run. added: name or formula of an effect (None: no effect).
     dropped: names of effects to take out (None: each that is not needed). by: who chose the step. table: by which it
-    was chosen; None: that of the state. Raises InputError where the effect cannot be added, or where one to be dropped
+    was chosen, together with others that stay; None: that of the state. Raises InputError where the effect cannot be added, or where one to be dropped
     is not in the model.
     """
     if added is not None:
         _refuse(state.result, added, can_read=refits.source is not None)
     result = state.result if added is None else refits.with_effects(state.result, (added,))
     protected = state.protected | ({_name(added, result)} if added is not None else set[str]())
+    protected |= set[str]() if table is None else {*table.first.effects}
     removed = list[Removal]()
     while (removal := _next_removal(result, protected, dropped, len(removed))) is not None:
         both = zip(result.model.effects, result.settings.effects, strict=True)
