@@ -8,6 +8,7 @@ are not named.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -42,6 +43,7 @@ from kf_calib.diagnosis.slew_effects import of_slews
 from kf_calib.diagnosis.verdict import format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
+from kf_calib.errors import UnobservableError
 from kf_calib.estimation.filter_history import readings_of
 from kf_calib.estimation.outlying_dwell import wrong_dwell
 from kf_calib.estimation.results import Calibration
@@ -200,10 +202,16 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
 
 
 def _with(refits: Refits, before: Calibration, row: Hypothesis, name: str, family: str) -> Hypothesis:
-    """Return a row with one effect more, fitted together with the others if it is likely enough to be told."""
+    """Return a row with one effect more, fitted together with the others if it is likely enough to be told; nothing
+    speaks for one that does nothing beside the others."""
     effects, families = (*row.effects, name), tuple(dict.fromkeys([*row.families, family]))
-    refit = refits.with_effects(before, (*effects, *row.formulas)) if row.probability >= LISTED else None
-    return replace(row, effects=effects, families=families, refit=refit)
+    row = replace(row, effects=effects, families=families)
+    if row.probability < LISTED:
+        return replace(row, refit=None)
+    try:
+        return replace(row, refit=refits.with_effects(before, (*effects, *row.formulas)))
+    except UnobservableError:
+        return replace(row, log_evidence=-math.inf, refit=None)
 
 
 def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:

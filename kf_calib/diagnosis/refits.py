@@ -100,7 +100,8 @@ class Refits:
                     return again
             refitted = replace(evaluate_fit(fitted, settings), counts=before.counts, readings=before.readings)
             refuse_unseen(refitted)
-            for effect in fitted.linearised.model.effects:
+            known = {str(effect) for effect in before.model.effects}
+            for effect in (each for each in fitted.linearised.model.effects if str(each) not in known):
                 if not (effect.states or effect.walks or effect.unknown):
                     raise UnobservableError(f"{effect} does what others in the model do, in these orientations: leave "
                                             "it out, or one of these.")  # fmt: skip

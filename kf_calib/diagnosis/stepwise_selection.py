@@ -28,7 +28,7 @@ from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import dwells_apart
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.fit import Fit
@@ -315,9 +315,14 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
         if step.name not in index or step.name not in before.ambiguity:
             continue
         k, others = index[step.name], [name for name in before.ambiguity if name not in index]
-        refitted = {name: refits.of(result, [*effects[:k], name, *effects[k + 1 :]]) for name in others}
-        replacements = [Alternative(name, refit) for name, refit in refitted.items()]
-        replacements = [each for each in replacements if each.result.consistency.consistent is not False]
+        replacements = list[Alternative]()
+        for name in others:
+            try:
+                refit = refits.of(result, [*effects[:k], name, *effects[k + 1 :]])
+            except UnobservableError:  # beside the others it does nothing of its own
+                continue
+            if refit.consistency.consistent is not False:
+                replacements.append(Alternative(name, refit))
         alternatives += [Alternative(step.name, result), *replacements] if replacements else []
     return replace(state, alternatives=tuple(alternatives))
 
@@ -360,8 +365,8 @@ def take_step(
 
     state: the improvement before. refits: those of the run. added: name or formula of an effect (None: no effect).
     dropped: names of effects to take out (None: each that is not needed). by: who chose the step. table: by which it
-    was chosen, together with others that stay; None: that of the state. Raises InputError where the effect cannot be added, or where one to be dropped
-    is not in the model.
+    was chosen, together with others that stay; None: that of the state. Raises InputError where the effect cannot be
+    added, or where one to be dropped is not in the model.
     """
     if added is not None:
         _refuse(state.result, added, can_read=refits.source is not None)
