@@ -111,7 +111,7 @@ def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
     first = said["hypotheses"][0]
     assert first["effects"] == ["encoder-harmonic-1:z"] and first["formula"] is None
     assert said["families"][0] == {"family": "gimbal and encoder", "probability": pytest.approx(1.0, abs=0.02)}
-    assert sum(row["probability"] for row in said["hypotheses"]) == pytest.approx(1.0)
+    assert sum(row["probability"] for row in said["hypotheses"]) == pytest.approx(1.0, abs=1e-3)  # few are not listed
     assert found.sure and "Missing: encoder-harmonic-1:z" in found.verdict
     assert found.missing and found.before_in_noise_left is None  # noise that is stated stays as it is
     odds = [row["log10_odds_to_next"] for row in said["hypotheses"][:-1]]
