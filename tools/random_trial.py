@@ -166,11 +166,12 @@ def _improved(run: RandomRun) -> tuple[str, str]:
 @click.option("--usual", is_flag=True, help="Each effect with a probability of 0.15, of a usual size.")
 def main(runs: int, first: int, jobs: int, improving: bool, usual: bool) -> None:
     """Print each run that ended otherwise than it should, and how many ended how."""
-    ends, usual = Counter[str](), {"refused", "right name", "unknown", "agrees", "not sure", "consistent", "ambiguous"}
+    ends = Counter[str]()
+    expected = {"refused", "right name", "unknown", "agrees", "not sure", "consistent", "ambiguous"}
     with ProcessPoolExecutor(jobs) as pool:
         for seed, end, said in pool.map(partial(played, improving, usual), range(first, first + runs)):
             ends[end] += 1
-            if end not in usual:
+            if end not in expected:
                 print(f"{seed}: {end}: {said}\n", flush=True)
     print("\n".join(f"{count:5d}  {end}" for end, count in ends.most_common()))
 

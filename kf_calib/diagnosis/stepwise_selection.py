@@ -331,7 +331,7 @@ def next_effects(diagnosis: Diagnosis, accept_first: bool = False) -> tuple[str,
     """The effect to add next: of those that are missing with 95 % probability, whether alone or with others, the one
     that explains most; an error of a gimbal with that of the others, which they have for the same reason.
 
-    None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
+    Empty where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
     if diagnosis.test.consistent is not False or not diagnosis.missing or diagnosis.table is None:
         return ()
