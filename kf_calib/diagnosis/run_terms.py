@@ -25,7 +25,15 @@ from kf_calib.diagnosis.run_likelihood import (
     log_bayes_beside,
     orthonormal_columns,
 )
-from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, UnknownTerm, text_named, unknown_terms
+from kf_calib.diagnosis.unknown_terms import (
+    MOST_ALTERNATIVES,
+    RETURNING,
+    UnknownTerm,
+    constants_s,
+    of_three,
+    text_named,
+    unknown_terms,
+)
 from kf_calib.diagnosis.within_rows import Courses, log_bayes_by_size
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, RotationEffect, Stimulus, effect_named, walk_named
@@ -36,7 +44,10 @@ from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.within_dwell_trend import trend_beside
 from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.terms import Scatter
+from kf_calib.support.tail_probabilities import LEVEL
 
 _DECADES = 7.0  # above one sigma: sizes of what has no usual size
 _NODES = 40  # sizes that are tried: the likelihood of q columns is as wide as 1 / sqrt(2 q) of its logarithm
@@ -48,6 +59,7 @@ _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, two a dwell, an
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _SETTINGS = 3.0  # setting errors, as share of a column, by which it is left of the model and is still not seen
+_LONGEST = 4.0  # time constant of what decays after an arrival, over a dwell
 _WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
@@ -128,6 +140,7 @@ class RunTerms:
         self._add_effects(columns, test, fitted)
         self._add_unknown(columns)
         self._add_orientations(columns)
+        self._add_arrivals(columns, noise)
         if self.walk:
             self._add_walk(columns)
         self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects, blocks=columns.blocks)
@@ -196,6 +209,23 @@ class RunTerms:
             self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 
+    def _add_arrivals(self, columns: _Columns, noise: Noise) -> None:
+        """Add an unknown cause that each arrival starts anew, in each dwell by another amount of either sign, and that
+        decays, where readings change within dwells by more than noise of this kind."""
+        dwells, blocks = self._linearised.dwells, list[list[int]]()
+        white = noise.with_terms(Scatter(np.zeros(3), stated=True))
+        changes = trend_beside(self._linearised, white, self._linearised.state)
+        if len(dwells) > _WAVES or changes is None or changes.p_value > LEVEL:
+            return
+        numbers = np.repeat(np.arange(len(dwells)), 3 * dwells.folded.piece_numbers)
+        for tau_s in constants_s(1, _LONGEST * max(dwell.end_s - dwell.start_s for dwell in dwells)):
+            part = columns.add([_Visits(numbers, len(dwells), tau_s)])
+            starts = range(part.start, part.stop, len(dwells))
+            blocks.append([columns.block(slice(first, first + len(dwells)), weight=1.0) for first in starts])
+        neighbours = [[*itertools.chain(*zip(*few, strict=True))] for few in of_three(blocks)]
+        self.unknown.append(UnknownTerm("time since arrival (by another amount in each dwell)", "memory", ()))
+        columns.irregular(f"?{len(self.unknown) - 1}", neighbours, [np.ones(len(neighbours[0]) // 3 * len(dwells))])
+
     def _add_walk(self, columns: _Columns) -> None:
         """Add a random walk of the biases and, unknown, one of the scale factors; either as the integral of a walk is,
         smooth, with a spectrum that falls with w^2 more; and biases that change as irregularly and come back: the
@@ -212,7 +242,7 @@ class RunTerms:
         returning = [1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s]
         returning.append(np.sqrt(rates / rates[-1]))
         family = effect_named(self.walk, self.bench).family
-        columns.irregular(self.walk, of_bias, [even])
+        columns.irregular(self.walk, [[of_bias]], [even])
         for driver, of_driver, block, scales in (
             ("time (smooth)", family, of_bias_smooth, [smooth]),
             ("time and specific force (smooth)", "scale in time", of_scale_smooth, [smooth]),
@@ -220,7 +250,7 @@ class RunTerms:
             (RETURNING, family, of_bias, returning),
         ):
             self.unknown.append(UnknownTerm(driver, of_driver, ()))
-            columns.irregular(f"?{len(self.unknown) - 1}", block, scales)
+            columns.irregular(f"?{len(self.unknown) - 1}", [[block]], scales)
 
     def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
         """What is left of the courses of the readings within dwells by an unknown function, or a random walk, as a term
@@ -475,24 +505,24 @@ class _Columns:
         places = np.concatenate([self._places[block] for block in blocks])
         self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, scales=scales))
 
-    def irregular(self, row: str, block: int, spectra: Sequence[Floats]) -> None:
-        """Add terms with the waves (3 n,) of a block, n of each of the three accelerometers: one term for each of some
-        factors (n,) of the waves, all as likely."""
-        for scales in spectra:
+    def irregular(self, row: str, alternatives: Sequence[Sequence[int]], spectra: Sequence[Floats]) -> None:
+        """Add terms with the columns (3 n,) of some blocks, n of each of the three accelerometers: one term for each of
+        the alternatives and of some factors (n,) of the columns, all as likely."""
+        for blocks, scales in itertools.product(alternatives, spectra):
             count = len(scales)
             bearers = tuple(slice(k, k + count) for k in range(0, 3 * count, count))
-            log_share = -math.log(len(spectra))
-            self.term(row, [block], log_share, bearers=bearers, scales=np.tile(scales, 3))
+            log_share = -math.log(len(spectra) * len(alternatives))
+            self.term(row, blocks, log_share, bearers=bearers, scales=np.tile(scales, 3))
 
 
 class _Visits(Effect):
-    """A bias of each accelerometer that is another in each orientation: numbers (m,) of the orientations of all
-    instants, and how many there are."""
+    """A bias of each accelerometer that is another in each orientation, or dwell, and decays there: numbers (m,) of
+    those of all instants, and how many there are; tau_s: time constant of the decay."""
 
     name, title, source = "visits", "", ""
 
-    def __init__(self, numbers: Indices, count: int) -> None:
-        self.numbers, self.count = numbers, count
+    def __init__(self, numbers: Indices, count: int, tau_s: float = math.inf) -> None:
+        self.numbers, self.count, self.tau_s = numbers, count, tau_s
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -501,8 +531,9 @@ class _Visits(Effect):
     def columns(self, s: Stimulus) -> Floats:
         instants = np.arange(len(self.numbers))[s.places if s.whole is not None else slice(None)]
         columns = np.zeros((len(s), 3, 3, self.count))
+        values = np.exp(-s.since_arrival_s / self.tau_s)
         for i in range(3):
-            columns[np.arange(len(s)), i, i, self.numbers[instants]] = 1.0
+            columns[np.arange(len(s)), i, i, self.numbers[instants]] = values
         return columns.reshape(len(s), 3, -1)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from kf_calib.dwells.sufficient_statistics import Dwell
 RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
+_Function = TypeVar("_Function")
 _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
@@ -182,19 +184,19 @@ def _waves(angle: str) -> tuple[str, str]:
     return f"sin({angle})", f"cos({angle})"
 
 
-def _constants_s(least_s: int, longest_s: float) -> list[int]:
+def constants_s(least_s: int, longest_s: float) -> list[int]:
     """Time constants that are tried, the least in any case."""
     return [least_s * k for k in _DECAYS if k == 1 or least_s * k <= longest_s]
 
 
-def _of_three(texts: Sequence[str]) -> list[tuple[str, ...]]:
+def of_three(functions: Sequence[_Function]) -> list[tuple[_Function, ...]]:
     """Functions of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
-    return [tuple(texts[k : k + 3]) for k in range(max(len(texts) - 2, 1))]
+    return [tuple(functions[k : k + 3]) for k in range(max(len(functions) - 2, 1))]
 
 
 def _decays(time: str, least_s: int, longest_s: float) -> list[tuple[str, ...]]:
     """Decays of any time constant."""
-    return _of_three([f"exp(-{time}/({tau_s}*s))" for tau_s in _constants_s(least_s, longest_s)])
+    return of_three([f"exp(-{time}/({tau_s}*s))" for tau_s in constants_s(least_s, longest_s)])
 
 
 def _with_forces(symbol: str) -> list[str]:
@@ -234,7 +236,7 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
     products = [*_with_forces("t"), *(f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7))]
     yield _term("time and specific force", "scale in time", products)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
-    creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *_constants_s(10, dwells[-1].end_s))]
+    creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *constants_s(10, dwells[-1].end_s))]
     # between neighbouring frequencies all are sums of these
     waves = {n: _waves(f"{n}*pi*t/{run_s}") for n in range(1, 2 * min(_TURNS, len(dwells) // 2) + 2)}
     oscillations = [(*waves[n - 1], *waves[n], *waves[n + 1]) for n in range(2, len(waves), 2)]
@@ -296,9 +298,9 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
     ways = [(f"gimbal {k}", f"q{k}_way") for k in range(1, gimbals + 1)]
     if gimbals > 1:
         ways.append(("all gimbals", f"({'+'.join(way for _, way in ways)})"))
-    constants_s = _constants_s(10, 10.0 * dwells[-1].end_s)
+    taus_s = constants_s(10, 10.0 * dwells[-1].end_s)
     for words, way in ways:
-        courses = [(way,), *_of_three([f"({way}-lag({way},{tau_s}*s))" for tau_s in constants_s])]
+        courses = [(way,), *of_three([f"({way}-lag({way},{tau_s}*s))" for tau_s in taus_s])]
         for place in (place for place in places if place.lively):
             where = f" ({place.words})" if place.words else ""
             yield _one_of(f"way of {words}{where}", place.family, [place.of(course) for course in courses])
@@ -307,8 +309,8 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
 def _of_history(gimbals: int, dwells: Sequence[Dwell], slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
     """What follows the force across, an angle or the temperature with a time constant: between two all others are sums
     of both."""
-    constants_s = _constants_s(10, dwells[-1].end_s)
-    between = [*itertools.pairwise(constants_s)] or [(constants_s[0],)]
+    taus_s = constants_s(10, dwells[-1].end_s)
+    between = [*itertools.pairwise(taus_s)] or [(taus_s[0],)]
 
     def lagging(*quantities: str, times: str = "") -> list[tuple[str, ...]]:
         """Return the alternatives of these quantities together, times a force."""

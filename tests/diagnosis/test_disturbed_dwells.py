@@ -148,20 +148,39 @@ def test_several_disturbed_dwells_are_told(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_readings_that_change_in_all_dwells_are_no_disturbed_dwells() -> None:
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_readings_that_change_in_all_dwells_are_no_disturbed_dwells(seed: int) -> None:
+    """They were a random walk of the biases with 99.5 %, or a second-order term with 98 %."""
+
     def creeping(state: State) -> np.ndarray:
-        signs = np.random.default_rng(1).choice([-1.0, 1.0], 18)[np.minimum(state.dwell, 17)]
+        signs = np.random.default_rng(seed).choice([-1.0, 1.0], 18)[np.minimum(state.dwell, 17)]
         return 2e-4 * (signs * np.exp(-state.since_s / 3.0))[:, None] * np.array([1.0, 1.0, 0.0])
 
-    diagnosis = diagnose(IndependentBench(4, 18, bias=creeping))
+    diagnosis = diagnose(IndependentBench(3 + seed, 18, bias=creeping))
     assert diagnosis.apart == () and diagnosis.test.consistent is False
 
     def knocked(state: State) -> np.ndarray:
         at_the_end = (state.dwell == 17) & (state.since_s > 15.0)
         return creeping(state) + 2e-4 * at_the_end[:, None] * np.exp(-(state.since_s - 15.0)[:, None] / 3.0)
 
-    diagnosis = diagnose(IndependentBench(4, 18, bias=knocked), replicate=False)
+    diagnosis = diagnose(IndependentBench(3 + seed, 18, bias=knocked), replicate=False)
     assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.likeliest is not None
+    assert diagnosis.likeliest.driver == "time since arrival (by another amount in each dwell)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tau_s", "size_mps2"), [(0.7, 3e-4), (2.0, 6e-5), (5.0, 6e-5), (12.0, 6e-5), (12.0, 3e-4)])
+def test_what_each_arrival_starts_anew_is_no_effect(tau_s: float, size_mps2: float) -> None:
+    """In each dwell by another amount: it was a walk, a warm-up or settling with up to 99.5 %."""
+
+    def creeping(state: State) -> np.ndarray:
+        amounts = np.random.default_rng(3).normal(size=(24, 3))[np.minimum(state.dwell, 23)]
+        return size_mps2 * amounts * np.exp(-state.since_s / tau_s)[:, None] * np.array([0.0, 1.0, 0.0])
+
+    diagnosis = diagnose(IndependentBench(5, bias=creeping), replicate=False)
+    assert diagnosis.unknown and diagnosis.likeliest is not None, diagnosis.verdict
+    assert diagnosis.likeliest.driver == "time since arrival (by another amount in each dwell)"
 
 
 @pytest.mark.slow
