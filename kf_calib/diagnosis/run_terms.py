@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
@@ -30,7 +30,6 @@ from kf_calib.diagnosis.unknown_terms import (
     RETURNING,
     UnknownTerm,
     constants_s,
-    of_three,
     text_named,
     unknown_terms,
 )
@@ -59,7 +58,14 @@ _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, two a dwell, an
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _SETTINGS = 3.0  # setting errors, as share of a column, by which it is left of the model and is still not seen
-_LONGEST = 4.0  # time constant of what decays after an arrival, over a dwell
+_DECAY: tuple[Callable[[Floats], Floats], ...] = (
+    lambda u: np.exp(-u),
+    lambda u: u * np.exp(-u),
+    lambda u: 0.5 * (u * u - u) * np.exp(-u),
+)
+"""A decay and its derivatives by the logarithm of its time constant, Taylor's series, of t/tau."""
+_SIZES_OF_DECAY = (1.0, 0.33, 0.15)  # rms of powers of a logarithm that is up to half of one to the next constant
+_INSTANTS = 200
 _WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
@@ -218,13 +224,18 @@ class RunTerms:
         if len(dwells) > _WAVES or changes is None or changes.p_value > LEVEL:
             return
         numbers = np.repeat(np.arange(len(dwells)), 3 * dwells.folded.piece_numbers)
-        for tau_s in constants_s(1, _LONGEST * max(dwell.end_s - dwell.start_s for dwell in dwells)):
-            part = columns.add([_Visits(numbers, len(dwells), tau_s)])
-            starts = range(part.start, part.stop, len(dwells))
-            blocks.append([columns.block(slice(first, first + len(dwells)), weight=1.0) for first in starts])
-        neighbours = [[*itertools.chain(*zip(*few, strict=True))] for few in of_three(blocks)]
+        longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
+        instants_s = np.linspace(0.0, longest_s, _INSTANTS)
+        for tau_s in constants_s(1, longest_s):
+            blocks.append([])
+            for course, size in zip(_DECAY, _SIZES_OF_DECAY, strict=True):
+                part = columns.add([_Visits(numbers, len(dwells), lambda t_s, f=course, tau_s=tau_s: f(t_s / tau_s))])
+                weight = size * float(np.linalg.norm(course(instants_s / tau_s)))
+                starts = range(part.start, part.stop, len(dwells))
+                blocks[-1] += [columns.block(slice(first, first + len(dwells)), weight=weight) for first in starts]
+        alternatives = [[each[k + 3 * n] for k in range(3) for n in range(len(_DECAY))] for each in blocks]
         self.unknown.append(UnknownTerm("time since arrival (by another amount in each dwell)", "memory", ()))
-        columns.irregular(f"?{len(self.unknown) - 1}", neighbours, [np.ones(len(neighbours[0]) // 3 * len(dwells))])
+        columns.irregular(f"?{len(self.unknown) - 1}", alternatives, [np.ones(len(_DECAY) * len(dwells))])
 
     def _add_walk(self, columns: _Columns) -> None:
         """Add a random walk of the biases and, unknown, one of the scale factors; either as the integral of a walk is,
@@ -516,13 +527,13 @@ class _Columns:
 
 
 class _Visits(Effect):
-    """A bias of each accelerometer that is another in each orientation, or dwell, and decays there: numbers (m,) of
-    those of all instants, and how many there are; tau_s: time constant of the decay."""
+    """A bias of each accelerometer that is another in each orientation, or dwell: numbers (m,) of
+    those of all instants, and how many there are; course: of the time since arrival, that it has."""
 
     name, title, source = "visits", "", ""
 
-    def __init__(self, numbers: Indices, count: int, tau_s: float = math.inf) -> None:
-        self.numbers, self.count, self.tau_s = numbers, count, tau_s
+    def __init__(self, numbers: Indices, count: int, course: Callable[[Floats], Floats] = np.ones_like) -> None:
+        self.numbers, self.count, self.course = numbers, count, course
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -531,7 +542,7 @@ class _Visits(Effect):
     def columns(self, s: Stimulus) -> Floats:
         instants = np.arange(len(self.numbers))[s.places if s.whole is not None else slice(None)]
         columns = np.zeros((len(s), 3, 3, self.count))
-        values = np.exp(-s.since_arrival_s / self.tau_s)
+        values = self.course(s.since_arrival_s)
         for i in range(3):
             columns[np.arange(len(s)), i, i, self.numbers[instants]] = values
         return columns.reshape(len(s), 3, -1)

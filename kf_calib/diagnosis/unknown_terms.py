@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from kf_calib.dwells.sufficient_statistics import Dwell
 RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
-_Function = TypeVar("_Function")
 _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
@@ -189,14 +187,14 @@ def constants_s(least_s: int, longest_s: float) -> list[int]:
     return [least_s * k for k in _DECAYS if k == 1 or least_s * k <= longest_s]
 
 
-def of_three(functions: Sequence[_Function]) -> list[tuple[_Function, ...]]:
+def _of_three(texts: Sequence[str]) -> list[tuple[str, ...]]:
     """Functions of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
-    return [tuple(functions[k : k + 3]) for k in range(max(len(functions) - 2, 1))]
+    return [tuple(texts[k : k + 3]) for k in range(max(len(texts) - 2, 1))]
 
 
 def _decays(time: str, least_s: int, longest_s: float) -> list[tuple[str, ...]]:
     """Decays of any time constant."""
-    return of_three([f"exp(-{time}/({tau_s}*s))" for tau_s in constants_s(least_s, longest_s)])
+    return _of_three([f"exp(-{time}/({tau_s}*s))" for tau_s in constants_s(least_s, longest_s)])
 
 
 def _with_forces(symbol: str) -> list[str]:
@@ -300,7 +298,7 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
         ways.append(("all gimbals", f"({'+'.join(way for _, way in ways)})"))
     taus_s = constants_s(10, 10.0 * dwells[-1].end_s)
     for words, way in ways:
-        courses = [(way,), *of_three([f"({way}-lag({way},{tau_s}*s))" for tau_s in taus_s])]
+        courses = [(way,), *_of_three([f"({way}-lag({way},{tau_s}*s))" for tau_s in taus_s])]
         for place in (place for place in places if place.lively):
             where = f" ({place.words})" if place.words else ""
             yield _one_of(f"way of {words}{where}", place.family, [place.of(course) for course in courses])
