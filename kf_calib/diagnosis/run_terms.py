@@ -58,13 +58,17 @@ _FEWEST_WAVES, _WAVES, _SMOOTH = 24, 40, 12  # of a random walk, two a dwell, an
 _RATIO = 0.01  # prior probability of one ratio of the sizes that three accelerometers have: one of 3 * 6 * 6
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _SETTINGS = 3.0  # setting errors, as share of a column, by which it is left of the model and is still not seen
-_DECAY: tuple[Callable[[Floats], Floats], ...] = (
-    lambda u: np.exp(-u),
-    lambda u: u * np.exp(-u),
-    lambda u: 0.5 * (u * u - u) * np.exp(-u),
+_Course = Callable[[Floats], Floats]
+_DECAY: tuple[tuple[float, _Course], ...] = (
+    (1.0, lambda u: np.exp(-u)),
+    (0.33, lambda u: u * np.exp(-u)),  # rms of a logarithm that is up to half of one to the next constant
+    (0.15, lambda u: 0.5 * (u * u - u) * np.exp(-u)),
 )
-"""A decay and its derivatives by the logarithm of its time constant, Taylor's series, of t/tau."""
-_SIZES_OF_DECAY = (1.0, 0.33, 0.15)  # rms of powers of a logarithm that is up to half of one to the next constant
+"""Sizes of a decay and its derivatives by the logarithm of its time constant, Taylor's series, of t/tau."""
+_RAMP: tuple[tuple[float, _Course], ...] = (
+    (1.0, lambda u: u), (0.3, lambda u: u * u), (0.3, np.ones_like)
+)  # fmt: skip
+"""Sizes of what goes on through a dwell, of t over its length."""
 _INSTANTS = 200
 _WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
@@ -217,25 +221,31 @@ class RunTerms:
 
     def _add_arrivals(self, columns: _Columns, noise: Noise) -> None:
         """Add an unknown cause that each arrival starts anew, in each dwell by another amount of either sign, and that
-        decays, where readings change within dwells by more than noise of this kind."""
-        dwells, blocks = self._linearised.dwells, list[list[int]]()
+        decays or goes on, where readings change within dwells by more than noise of this kind."""
+        dwells = self._linearised.dwells
         white = noise.with_terms(Scatter(np.zeros(3), stated=True))
         changes = trend_beside(self._linearised, white, self._linearised.state)
         if len(dwells) > _WAVES or changes is None or changes.p_value > LEVEL:
             return
         numbers = np.repeat(np.arange(len(dwells)), 3 * dwells.folded.piece_numbers)
         longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
-        instants_s = np.linspace(0.0, longest_s, _INSTANTS)
-        for tau_s in constants_s(1, longest_s):
-            blocks.append([])
-            for course, size in zip(_DECAY, _SIZES_OF_DECAY, strict=True):
-                part = columns.add([_Visits(numbers, len(dwells), lambda t_s, f=course, tau_s=tau_s: f(t_s / tau_s))])
-                weight = size * float(np.linalg.norm(course(instants_s / tau_s)))
-                starts = range(part.start, part.stop, len(dwells))
-                blocks[-1] += [columns.block(slice(first, first + len(dwells)), weight=weight) for first in starts]
-        alternatives = [[each[k + 3 * n] for k in range(3) for n in range(len(_DECAY))] for each in blocks]
+        kinds = [*((_DECAY, tau_s) for tau_s in constants_s(1, longest_s)), (_RAMP, longest_s)]
+        alternatives = [
+            [*self._blocks_of_dwells(columns, numbers, courses, unit_s, longest_s)] for courses, unit_s in kinds
+        ]
         self.unknown.append(UnknownTerm("time since arrival (by another amount in each dwell)", "memory", ()))
         columns.irregular(f"?{len(self.unknown) - 1}", alternatives, [np.ones(len(_DECAY) * len(dwells))])
+
+    def _blocks_of_dwells(self, columns: _Columns, numbers: Indices, courses: Sequence[tuple[float, _Course]],
+                          unit_s: float, longest_s: float) -> Iterator[int]:  # fmt: skip
+        """Yield blocks of columns of each accelerometer, one for each of some courses, with a column for each dwell."""
+        count, blocks = len(self._linearised.dwells), list[list[int]]()
+        for size, course in courses:
+            part = columns.add([_Visits(numbers, count, lambda t_s, f=course: f(t_s / unit_s))])
+            weight = size * float(np.linalg.norm(course(np.linspace(0.0, longest_s / unit_s, _INSTANTS))))
+            starts = range(part.start, part.stop, count)
+            blocks.append([columns.block(slice(first, first + count), weight=weight) for first in starts])
+        yield from itertools.chain(*zip(*blocks, strict=True))
 
     def _add_walk(self, columns: _Columns) -> None:
         """Add a random walk of the biases and, unknown, one of the scale factors; either as the integral of a walk is,
@@ -532,7 +542,7 @@ class _Visits(Effect):
 
     name, title, source = "visits", "", ""
 
-    def __init__(self, numbers: Indices, count: int, course: Callable[[Floats], Floats] = np.ones_like) -> None:
+    def __init__(self, numbers: Indices, count: int, course: _Course = np.ones_like) -> None:
         self.numbers, self.count, self.course = numbers, count, course
 
     @property
