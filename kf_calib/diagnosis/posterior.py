@@ -60,6 +60,7 @@ _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _BESIDE = 2  # rows of effects, and of unknown functions, beside which dwells are tried
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
+_INEXACT = 0.1  # share of functions that each arrival changes by another amount
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
 _NO_SIGN, _ONE = 0.5, 1e-3  # what is left of an effect beside one that is the same: of chi-squared, and a share
@@ -294,8 +295,10 @@ class RunPosterior:
         run = self._run.likelihood
         for row in unknown[:_BESIDE]:
             if (courses := self._courses_beside(row)) is not None:
-                columns = self._run.terms[self._best[f"?{self._number(row)}"]].columns
-                beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), courses))
+                name = f"?{self._number(row)}"
+                columns, alone = self._run.terms[self._best[name]].columns, self._by_row(self._log_evidence)[name]
+                exact = self._row_of((name,), alone)  # what differs in each dwell is no dwell that is off
+                beside.append(self._with_dwells(exact, run.spanned.beside(columns, run.lengths), courses))
         return beside
 
     def _courses_beside(self, row: Hypothesis) -> Courses | None:
@@ -349,14 +352,17 @@ class RunPosterior:
             name, is_known = terms[head].row, terms[head].is_known
             stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
             logs = np.repeat(alone[h][None], len(terms), axis=0)
-            some = None if is_known else np.array([term.is_known or term.row == name for term in terms])
+            beside = name, self._run.arrivals
+            some = None if is_known else np.array([term.is_known or term.row in beside for term in terms])
             for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
                 sizes = [k - first for k in likely[h][family]]
                 logs[:, likely[h][family]] += self._run.log_bayes(noises, sizes, explained[h, family], some)
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
+            of_rows = self._by_row(logs)
             if not is_known:
-                pairs[(name,)] = self._of_two_summands(head, logs)
-            for other, log in self._by_row(logs).items():
+                left = of_rows.get(self._run.arrivals, -math.inf) + math.log(_INEXACT)
+                pairs[(name,)] = float(np.logaddexp(self._of_two_summands(head, logs), left))
+            for other, log in of_rows.items():
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if self._is_pair(name, other) and (is_known or not other.startswith("?")):
                     pairs[key] = max(pairs.get(key, -math.inf), log)

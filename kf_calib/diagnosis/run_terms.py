@@ -222,7 +222,7 @@ class RunTerms:
     def _add_arrivals(self, columns: _Columns, noise: Noise) -> None:
         """Add an unknown cause that each arrival starts anew, in each dwell by another amount of either sign, and that
         decays or goes on, where readings change within dwells by more than noise of this kind."""
-        dwells = self._linearised.dwells
+        dwells, self.arrivals = self._linearised.dwells, ""
         white = noise.with_terms(Scatter(np.zeros(3), stated=True))
         changes = trend_beside(self._linearised, white, self._linearised.state)
         if len(dwells) > _WAVES or changes is None or changes.p_value > LEVEL:
@@ -234,7 +234,8 @@ class RunTerms:
             [*self._blocks_of_dwells(columns, numbers, courses, unit_s, longest_s)] for courses, unit_s in kinds
         ]
         self.unknown.append(UnknownTerm("time since arrival (by another amount in each dwell)", "memory", ()))
-        columns.irregular(f"?{len(self.unknown) - 1}", alternatives, [np.ones(len(_DECAY) * len(dwells))])
+        self.arrivals = f"?{len(self.unknown) - 1}"
+        columns.irregular(self.arrivals, alternatives, [np.ones(len(_DECAY) * len(dwells))])
 
     def _blocks_of_dwells(self, columns: _Columns, numbers: Indices, courses: Sequence[tuple[float, _Course]],
                           unit_s: float, longest_s: float) -> Iterator[int]:  # fmt: skip

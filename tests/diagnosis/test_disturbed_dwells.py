@@ -197,11 +197,12 @@ def test_what_each_arrival_starts_anew_is_no_effect(
 
 
 @pytest.mark.slow
-def test_a_dwell_that_does_not_follow_what_all_others_do_is_told_and_not_walked_around() -> None:
-    """A gimbal that creeps after each move, but for one: a random walk of the biases took the difference."""
+def test_a_dwell_that_does_not_follow_what_all_others_do_is_not_walked_around() -> None:
+    """A gimbal that creeps after each move, but for one: a random walk of the biases took the difference. It is what
+    each arrival changes beside the function that all others follow."""
     after_moves = partial(creeping_gimbal, but=11)
     diagnosis = diagnose(IndependentBench(5, gimbals=after_moves), replicate=False)
-    assert diagnosis.apart == (12,) and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
     assert diagnosis.likeliest is not None
     assert diagnosis.likeliest.driver == "time since arrival and last move of gimbal 2"
 
