@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from kf_calib import Bench, diagnose, improve
 from kf_calib.bench.bench import axes_of
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.effects import kind_of
 from kf_calib.errors import KfCalibError
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
@@ -140,20 +141,15 @@ def _diagnosed(run: RandomRun) -> tuple[str, str]:
     if found.test.consistent and large:
         return "overlooked", found.verdict
     if found.missing and table is not None and table.probability(found.missing) >= SURE:
-        wrong = {*map(_kind, found.missing)} - run.names - {*map(_kind, table.same)}
+        wrong = {*map(kind_of, found.missing)} - run.names - {*map(kind_of, table.same)}
         return ("wrong name" if wrong else "right name"), found.verdict
     return ("unknown" if found.unknown else "agrees" if found.test.consistent else "not sure"), found.verdict
-
-
-def _kind(name: str) -> str:
-    """Return the name of an effect without the gimbal that has it."""
-    return name.partition(":")[0]
 
 
 def _improved(run: RandomRun) -> tuple[str, str]:
     """Return how an improvement ended, and its reason."""
     state = improve(run.source)
-    added = {_kind(str(step.name)) for step in state.steps}
+    added = {kind_of(str(step.name)) for step in state.steps}
     wrong = added - run.names
     return (f"added {', '.join(sorted(wrong))}" if wrong else state.because), state.reason
 

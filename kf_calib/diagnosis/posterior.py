@@ -46,7 +46,7 @@ from kf_calib.diagnosis.run_terms import (
 )
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.diagnosis.within_rows import Courses
-from kf_calib.effects import Effect, RotationEffect, effect_named
+from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
@@ -689,8 +689,7 @@ def _relations(cause: Sequence[Effect]) -> list[tuple[float, Floats]]:
     if others:
         return [(0.0, np.eye(sum(len(each.coefficients) for each in cause)))]
     matrices = [*effect.relations] or [np.eye(len(effect.coefficients))]
-    is_whole = not (isinstance(effect, RotationEffect) and effect.at_zero)
-    some = of_bearers(effect.bearers if is_whole else ())
+    some = of_bearers(effect.bearers)
     return [(log - math.log(len(matrices)), matrix[:, only]) for matrix in matrices for log, only in some]
 
 

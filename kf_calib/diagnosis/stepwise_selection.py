@@ -27,7 +27,7 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import dwells_apart
-from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
+from kf_calib.effects import as_text, effect_named, kind_of, merged, refuse_unknown
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import evaluate_fit
@@ -341,8 +341,7 @@ def next_effects(diagnosis: Diagnosis, accept_first: bool = False) -> tuple[str,
         return (max(probabilities, key=lambda name: probabilities[name]),) if accept_first else ()
     falls = {suspect.name: suspect.statistic for suspect in diagnosis.suspects}
     first = max(sure, key=lambda name: falls.get(name, 0.0))
-    kind, colon, _ = first.partition(":")
-    return first, *(name for name in sure if colon and name != first and name.startswith(f"{kind}:"))
+    return first, *(name for name in sure if name != first and kind_of(name) == kind_of(first))
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:

@@ -18,7 +18,7 @@ from kf_calib.diagnosis.hypothesis_table import (
 )
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.effects import effect_named
+from kf_calib.effects import effect_named, kind_of
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
@@ -318,7 +318,7 @@ def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
 
 def _effects_of(row: Hypothesis) -> str:
     """Return the effects of a row in words; of an error of several gimbals the name once."""
-    kinds = ["", *(name.partition(":")[0] for name in row.effects)]
+    kinds = ["", *map(kind_of, row.effects)]
     names = [name.removeprefix(kind) if kind == before else name
              for name, before, kind in zip(row.effects, kinds, kinds[1:], strict=False)]  # fmt: skip
     return names[0] if len(names) == 1 else f"{listing(names)} together"

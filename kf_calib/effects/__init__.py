@@ -24,8 +24,8 @@ from kf_calib.errors import InputError
 
 __all__ = [
     "Bearer", "Coefficient", "Effect", "RotationEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "described",
-    "effect_named", "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of", "programs_of",
-    "refuse_unfit", "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
+    "effect_named", "kind_of", "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of",
+    "programs_of", "refuse_unfit", "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
 ]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
@@ -105,6 +105,11 @@ def effect_named(text: str, bench: Bench) -> Effect:
     raise _unknown(text, names(bench))
 
 
+def kind_of(name: str) -> str:
+    """The name of an effect without the gimbal that has it."""
+    return name.partition(":")[0]
+
+
 def described(text: str) -> Effect | None:
     """The effect of that name without a bench: its coefficients, units and usual sizes hold on every bench, its columns
     on none. None where no effect is known by that name, as for a formula."""
@@ -120,7 +125,7 @@ def refuse_unknown(text: str) -> None:
         formula.split(text)
         return
     known = [*_PLAIN, *_OF_A_GIMBAL, *_registered]
-    if text.partition(":")[0] not in known:
+    if kind_of(text) not in known:
         raise _unknown(text, known)
 
 
@@ -139,7 +144,7 @@ def _unknown(text: str, known: list[str]) -> InputError:
 
 
 def _formula(text: str, bench: Bench) -> Effect:
-    name = formula.split(text)[0].partition(":")[0]
+    name = kind_of(formula.split(text)[0])
     origin = "the catalogue" if name in (*_PLAIN, *_OF_A_GIMBAL) else None
     origin = _registered[name].origin if name in _registered else origin
     if origin:

@@ -42,6 +42,7 @@ class RotationEffect(Effect):
             return self
         other = copy.copy(self)
         other.at_zero = frozenset(symbols).intersection(self.symbols)
+        other.bearers = () if other.at_zero else self.bearers
         return other
 
     @property
