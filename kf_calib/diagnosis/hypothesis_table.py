@@ -34,9 +34,14 @@ CREDIBLE = 0.99
 LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
-PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
-"""Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function; ``dwell``: one dwell
-alone is off; of several, each has that of one."""
+AS_WELL = " as well as "
+"""Between the drivers of two unknown functions."""
+
+PRIOR = {
+    "nothing": 0.4, "effect": 0.37, "pair": 0.08, "unknown": 0.1, "unknowns": 0.01, "beside": 0.02, "dwell": 0.02,
+}  # fmt: skip
+"""Prior probability of each kind of explanation; ``unknowns``: two unknown functions; ``beside``: an effect beside one;
+``dwell``: one dwell alone is off; of several, each has that of one."""
 
 _ALIKE = 0.05 * PRIOR["unknown"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 
@@ -47,8 +52,8 @@ class Hypothesis:
 
     - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added,
       alone or beside an effect.
-    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing,
-      "like a known effect" for a cause that cannot be told from one.
+    - driver: in words, what the formulas depend on, one thing or two; "irregular" for changes of an unknown cause that
+      follow nothing, "like a known effect" for a cause that cannot be told from one.
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
@@ -76,7 +81,7 @@ class Hypothesis:
     @property
     def causes(self) -> frozenset[str]:
         """The effects, and what the unknown function depends on."""
-        return frozenset({*self.effects, self.driver} - {""})
+        return frozenset({*self.effects, *self.driver.split(AS_WELL)} - {""})
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
 from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
+    AS_WELL,
     IRREGULAR,
     LISTED,
     NOISE,
@@ -243,10 +244,10 @@ class RunPosterior:
         unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
         families = [self._effects[name].family for name in effects]
         families += [term.family or NONE for term in unknown]
-        log += self._log_prior(effects, bool(unknown))
+        log += self._log_prior(effects, len(unknown))
         tested = [self._tested(name) for name in effects]
         statistic, dof = tested[0][0] if len(names) == len(effects) == 1 else 0.0, sum(dof for _, dof in tested)
-        driver = "".join(term.driver for term in unknown)
+        driver = AS_WELL.join(sorted(term.driver for term in unknown))
         return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
 
     @cached_property
@@ -254,11 +255,13 @@ class RunPosterior:
         """The effects that the run may have, by their names."""
         return {name: effect_named(name, self._before.bench) for name in self._run.names}
 
-    def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
-        """Return the log of the prior probability of some effects and, if so, an unknown function."""
+    def _log_prior(self, effects: Sequence[str], functions: int = 0) -> float:
+        """Return the log of the prior probability of some effects and unknown functions."""
         causes, unknown = max(self._run.causes, 2), len(self._run.unknown)
         prior = math.prod(self._effects[name].prior for name in effects)
-        if beside_unknown:
+        if functions == 2:
+            kind, among = "unknowns", math.comb(unknown, 2)
+        elif functions:
             kind, among = ("beside", causes * unknown) if effects else ("unknown", unknown)
         else:
             is_one = len(self._run.causes_of(effects)) == 1
@@ -340,8 +343,8 @@ class RunPosterior:
         return next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
 
     def _pairs(self) -> list[Hypothesis]:
-        """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summands
-        of unknown functions, with another one of the same function or an effect beside it."""
+        """Return the rows of the likeliest effects, and of the likeliest summands of unknown functions, each with any
+        other term beside it."""
         terms, pairs = self._run.terms, dict[tuple[str, ...], float]()
         heads = [*self._heads(), *self._summands_to_pair()]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
@@ -352,11 +355,9 @@ class RunPosterior:
             name, is_known = terms[head].row, terms[head].is_known
             stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
             logs = np.repeat(alone[h][None], len(terms), axis=0)
-            beside = name, self._run.arrivals
-            some = None if is_known else np.array([term.is_known or term.row in beside for term in terms])
             for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
                 sizes = [k - first for k in likely[h][family]]
-                logs[:, likely[h][family]] += self._run.log_bayes(noises, sizes, explained[h, family], some)
+                logs[:, likely[h][family]] += self._run.log_bayes(noises, sizes, explained[h, family])
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
             of_rows = self._by_row(logs)
             if not is_known:
@@ -364,7 +365,7 @@ class RunPosterior:
                 pairs[(name,)] = float(np.logaddexp(self._of_two_summands(head, logs), left))
             for other, log in of_rows.items():
                 key = (other, name) if (other, name) in pairs else (name, other)
-                if self._is_pair(name, other) and (is_known or not other.startswith("?")):
+                if self._is_pair(name, other) and (is_known or other != self._run.arrivals):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}

@@ -13,7 +13,7 @@ from functools import cache, cached_property
 import numpy as np
 from scipy.special import softmax
 
-from kf_calib.bench.arrays import Floats, Indices, Mask
+from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import GRID, CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
@@ -429,43 +429,39 @@ class RunTerms:
         """The products of the columns of all terms in noise of some sizes."""
         return self.likelihood.in_noises(shapes, squares, [alike.places for alike in self._alike])
 
-    def log_bayes(self, noises: InNoises, sizes: Sequence[int], explained: Floats | None = None,
-                  some: Mask | None = None) -> Floats:  # fmt: skip
-        """Log Bayes factors (terms, K) of all terms, or of some, in noise of K of the sizes; of others 0.
+    def log_bayes(self, noises: InNoises, sizes: Sequence[int], explained: Floats | None = None) -> Floats:
+        """Log Bayes factors (terms, K) of all terms in noise of K of the sizes.
 
         explained (K, f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
         """
         logs = np.zeros((len(self.terms), len(sizes)))
         for number, alike in enumerate(self._alike):
-            few = np.arange(len(alike.numbers)) if some is None else np.flatnonzero(some[alike.numbers])
-            logs[alike.numbers[few]] = self._log_bayes_of(noises, number, sizes, explained, few).T
+            logs[alike.numbers] = self._log_bayes_of(noises, number, sizes, explained).T
         return logs
 
-    def _log_bayes_of(self, noises: InNoises, number: int, sizes: Sequence[int], explained: Floats | None,
-                      few: Indices) -> Floats:  # fmt: skip
-        """Return the log Bayes factors (K, n) of some of the terms that are alike."""
+    def _log_bayes_of(self, noises: InNoises, number: int, sizes: Sequence[int], explained: Floats | None) -> Floats:
+        """Return the log Bayes factors (K, n) of the terms that are alike."""
         alike = self._alike[number]
-        squares, log_weights, centres = alike.squares[few], alike.log_weights[few], alike.centres[few]
+        squares, log_weights, centres = alike.squares, alike.log_weights, alike.centres
         if explained is None:
-            gram, along, lengths = self._products(noises, number, sizes, few)
+            gram, along, lengths = self._products(noises, number, sizes)
             return log_bayes(gram, along, squares, log_weights, centres, lengths)
-        parts = explained[..., alike.places[alike.which[few]]] * alike.scales[few]
+        parts = explained[..., alike.places[alike.which]] * alike.scales
         parts = np.moveaxis(parts, 1, 3)  # (K, n, q, f)
         if parts.shape[2] >= _WIDE and not centres.any():
             decomposed = zip(*(self._decomposed(noises, number, k) for k in sizes), strict=True)
-            squared, turns, along = (np.concatenate(each)[:, few] for each in decomposed)
+            squared, turns, along = map(np.concatenate, decomposed)
             return log_bayes_beside(squared, turns, along, parts, explained[..., -1], squares, log_weights)
-        gram, along, lengths = self._products(noises, number, sizes, few)
+        gram, along, lengths = self._products(noises, number, sizes)
         gram -= parts @ np.swapaxes(parts, 2, 3)
         along -= (parts @ explained[:, None, :, -1:])[..., 0]
         return log_bayes(gram, along, squares, log_weights, centres, lengths)
 
-    def _products(self, noises: InNoises, number: int, sizes: Sequence[int], few: Indices
-                  ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-        """Return G^T W G (K, n, q, q) and G^T W z (K, n, q) of some of the terms that are alike, and the largest
-        squares (K, n) of their columns."""
+    def _products(self, noises: InNoises, number: int, sizes: Sequence[int]) -> tuple[Floats, Floats, Floats]:
+        """Return G^T W G (K, n, q, q) and G^T W z (K, n, q) of the terms that are alike, and the largest squares (K, n)
+        of their columns."""
         alike = self._alike[number]
-        which, scales = alike.which[few], alike.scales[few]
+        which, scales = alike.which, alike.scales
         of_sizes = np.array(sizes)
         gram = noises.gram(number, of_sizes, which) * scales[:, :, None] * scales[:, None]
         along = noises.along[sizes][:, alike.places[which]] * scales
@@ -476,8 +472,7 @@ class RunTerms:
         they are tried beside."""
         key = noises, number, size
         if key not in self._decompositions:
-            every = np.arange(len(self._alike[number].numbers))
-            self._decompositions[key] = orthonormal_columns(*self._products(noises, number, [size], every))
+            self._decompositions[key] = orthonormal_columns(*self._products(noises, number, [size]))
         return self._decompositions[key]
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:

@@ -78,13 +78,14 @@ class Prior:
             pair = _one_of(rng, pairs, [weights[i] * weights[j] for i, j in pairs])
             chosen = sorted(names[k] for k in pair)
         parts = [self._of_row(rng, name) for name in chosen]
-        unknown = kind in {"unknown", "beside"}
-        if unknown:
-            parts.append(self._of_row(rng, f"?{rng.integers(len(self._terms.unknown))}"))
+        unknown = {"unknown": 1, "beside": 1, "unknowns": 2}.get(kind, 0)
+        of_unknown = rng.choice(len(self._terms.unknown), unknown, replace=False).tolist()
+        parts += [self._of_row(rng, f"?{number}") for number in of_unknown]
         if kind == "dwell":
             return DWELL, self._one_dwell(rng), {}
-        seen = [(name, part) for name, part in zip([*chosen, UNKNOWN], parts, strict=False) if part is not None]
-        label = " + ".join(name for name, _ in seen) or NOTHING
+        names = [*chosen, *(UNKNOWN for _ in of_unknown)]
+        seen = [(name, part) for name, part in zip(names, parts, strict=True) if part is not None]
+        label = " + ".join(dict.fromkeys(name for name, _ in seen)) or NOTHING
         known = {name: coefficients for name, (_, coefficients) in seen if coefficients}
         return label, sum((added for _, (added, _) in seen), nothing), {} if unknown else known
 
