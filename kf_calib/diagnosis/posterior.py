@@ -346,7 +346,8 @@ class RunPosterior:
         """Return the rows of the likeliest effects, and of the likeliest summands of unknown functions, each with any
         other term beside it."""
         terms, pairs = self._run.terms, dict[tuple[str, ...], float]()
-        heads = [*self._heads(), *self._summands_to_pair()]
+        if not (heads := [*self._heads(), *self._summands_to_pair()]):
+            return []
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
@@ -414,7 +415,7 @@ class RunPosterior:
         in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
         in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
         heads = list(dict.fromkeys([*in_noise, *in_none]))
-        heads += dict.fromkeys(self._ahead_of_pairs(list(best), heads))
+        heads += dict.fromkeys(self._ahead_of_pairs(list(best), heads) if len(best) > 1 else [])
         in_all = self._likeliest(k for k, term in enumerate(self._run.terms) if not term.alone)
         return [*dict.fromkeys(of[name] for of in (best, in_all) for name in heads if name in of)]
 
