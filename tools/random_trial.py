@@ -141,8 +141,9 @@ def _diagnosed(run: RandomRun) -> tuple[str, str]:
     if found.test.consistent and large:
         return "overlooked", found.verdict
     if found.missing and table is not None and table.probability(found.missing) >= SURE:
-        wrong = {*map(kind_of, found.missing)} - run.names - {*map(kind_of, table.same)}
-        return ("wrong name" if wrong else "right name"), found.verdict
+        wrong = {*map(kind_of, found.missing)} - run.names
+        is_same = bool({*map(kind_of, table.same)} & run.names)  # it is told under the other's name
+        return ("wrong name" if wrong and not is_same else "right name"), found.verdict
     return ("unknown" if found.unknown else "agrees" if found.test.consistent else "not sure"), found.verdict
 
 

@@ -272,8 +272,11 @@ def _of_jumps(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unk
     few_s = between_s[:: len(between_s) // _MOST_DECAYING + 1]
     decays = [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in few_s]
     for place in places:
-        steps = [(f"(t > {s:.6g}*s)",) for s in (between_s if place.words else moments_s)]
-        yield replace(place.one_of("a jump", steps), at_once=2)
+        least = len(place.formulas) - 1  # as many coefficients as dwells on one side would be just these dwells
+        of_place_s = between_s[least : len(between_s) - least] if place.words else moments_s
+        steps = [(f"(t > {s:.6g}*s)",) for s in of_place_s]
+        if steps:
+            yield replace(place.one_of("a jump", steps), at_once=2)
         if place.lively:
             yield place.one_of("a change of rate", rates)
             yield place.one_of("a decaying jump", decays)
