@@ -69,7 +69,7 @@ _RAMP: tuple[tuple[float, _Course], ...] = (
     (1.0, lambda u: u), (0.3, lambda u: u * u), (0.3, np.ones_like)
 )  # fmt: skip
 """Sizes of what goes on through a dwell, of t over its length."""
-_INSTANTS = 200
+_INSTANTS = 200  # of a dwell, at which the lengths of courses are compared
 _WIDE = 16  # columns from which on a decomposition takes longer than what others leave of it in all sizes
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
@@ -221,7 +221,7 @@ class RunTerms:
 
     def _add_arrivals(self, columns: _Columns, noise: Noise) -> None:
         """Add an unknown cause that each arrival starts anew, in each dwell by another amount of either sign, and that
-        decays or goes on, where readings change within dwells by more than noise of this kind."""
+        decays or goes on, where readings change within dwells by more than white noise does."""
         dwells, self.arrivals = self._linearised.dwells, ""
         white = noise.with_terms(Scatter(np.zeros(3), stated=True))
         changes = trend_beside(self._linearised, white, self._linearised.state)
@@ -533,8 +533,8 @@ class _Columns:
 
 
 class _Visits(Effect):
-    """A bias of each accelerometer that is another in each orientation, or dwell: numbers (m,) of
-    those of all instants, and how many there are; course: of the time since arrival, that it has."""
+    """A bias of each accelerometer that is another in each orientation, or dwell: numbers (m,) of these
+    at all instants, and how many there are. course: by what it is multiplied at times since arrival (m,), s."""
 
     name, title, source = "visits", "", ""
 
