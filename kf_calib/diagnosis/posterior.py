@@ -293,7 +293,7 @@ class RunPosterior:
     def _dwells_beside(self, rows: Sequence[Hypothesis], fitted: Sequence[_Fitted]) -> list[Hypothesis]:
         """Return the rows of dwells that are off beside the likeliest effects, and unknown functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
-        unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
+        unknown = [row for row in likeliest if self._number(row) is not None and not (row.effects or row.dwells)]
         beside = [self._with_dwells(*each) for each in fitted]
         run = self._run.likelihood
         for row in unknown[:_BESIDE]:
