@@ -146,7 +146,7 @@ class RunTerms:
         self.grade: Grade = sensor_grade(before.fit)
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.unknown: list[UnknownTerm] = [*unknown_terms(before.bench, before.fit.dwells)]
-        columns = _Columns()
+        columns, self._without_formula = _Columns(), dict[str, Effect]()
         self._add_effects(columns, test, fitted)
         self._add_unknown(columns)
         self._add_orientations(columns)
@@ -217,7 +217,9 @@ class RunTerms:
                 of_dwell[group] = k
             visits = _Visits(np.repeat(of_dwell, 3 * dwells.folded.piece_numbers), len(groups))
             self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
-            columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
+            row = f"?{len(self.unknown) - 1}"
+            self._without_formula[row] = visits
+            columns.term(row, [columns.block(columns.add([visits]))], 0.0)
 
     def _add_arrivals(self, columns: _Columns, noise: Noise) -> None:
         """Add an unknown cause that each arrival starts anew, in each dwell by another amount of either sign, and that
@@ -256,23 +258,25 @@ class RunTerms:
         dwells = self._linearised.dwells
         run_s, count = dwells[-1].end_s, min(max(2 * len(dwells), _FEWEST_WAVES), _WAVES)
         walks = [_Walk(run_s, most, of_scale) for of_scale in (False, True) for most in (count, min(count, _SMOOTH))]
-        of_bias, of_bias_smooth, of_scale, of_scale_smooth = (columns.block(columns.add([walk])) for walk in walks)
-        self._path = walks[0]
+        blocks = [columns.block(columns.add([walk])) for walk in walks]
         rates, even = walks[0].rates, np.ones(count)
         smooth = rates[0] / walks[1].rates
         taus_s = [run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
         returning = [1.0 / np.sqrt(1.0 + 1.0 / np.square(rates * tau_s)) for tau_s in taus_s]
         returning.append(np.sqrt(rates / rates[-1]))
         family = effect_named(self.walk, self.bench).family
-        columns.irregular(self.walk, [[of_bias]], [even])
-        for driver, of_driver, block, scales in (
-            ("time (smooth)", family, of_bias_smooth, [smooth]),
-            ("time and specific force (smooth)", "scale in time", of_scale_smooth, [smooth]),
-            ("time and specific force (irregular)", "scale in time", of_scale, [even]),
-            (RETURNING, family, of_bias, returning),
+        self._without_formula[self.walk] = walks[0]
+        columns.irregular(self.walk, [[blocks[0]]], [even])
+        for driver, of_driver, number, scales in (
+            ("time (smooth)", family, 1, [smooth]),
+            ("time and specific force (smooth)", "scale in time", 3, [smooth]),
+            ("time and specific force (irregular)", "scale in time", 2, [even]),
+            (RETURNING, family, 0, returning),
         ):
             self.unknown.append(UnknownTerm(driver, of_driver, ()))
-            columns.irregular(f"?{len(self.unknown) - 1}", [[block]], scales)
+            row = f"?{len(self.unknown) - 1}"
+            self._without_formula[row] = walks[number]
+            columns.irregular(row, [[blocks[number]]], scales)
 
     def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
         """What is left of the courses of the readings within dwells by an unknown function, or a random walk, as a term
@@ -285,16 +289,16 @@ class RunTerms:
         logs = term.sizes.logs + log_bayes_by_size(along**2, values, 1.0, squares).sum(axis=0)
         shrunk = squares[:, None] / (1.0 + squares[:, None] * values)
         likeliest = vectors @ (along * (softmax(logs) @ shrunk))
-        effects = self._effects_of(term)
+        effects = self.made_by(term)
         coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
         coefficients[term.only] = likeliest * scales * self.likelihood.scales[term.columns]
         states = self.likelihood.states_beside(covariance, term.columns, likeliest * scales)
         return self.likelihood.courses_at(states, np.zeros(0), effects, coefficients)
 
-    def _effects_of(self, term: RunTerm) -> list[Effect]:
-        """Return the effects that make the columns of an unknown function, or of a random walk."""
-        if term.row == self.walk:
-            return [self._path]
+    def made_by(self, term: RunTerm) -> list[Effect]:
+        """The effects that make the columns of an unknown function, or of a random walk."""
+        if term.row in self._without_formula:
+            return [self._without_formula[term.row]]
         summands = self.unknown[int(term.row[1:])].summands
         return [self.formula_of(text) for number in term.summands for text in summands[number]]
 

@@ -17,7 +17,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.hypothesis_table import PRIOR
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.run_likelihood import RunLikelihood
-from kf_calib.diagnosis.run_terms import _DECADES, EVERY, RunTerm, RunTerms, _Walk
+from kf_calib.diagnosis.run_terms import _DECADES, EVERY, RunTerm, RunTerms
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.table import DwellTable
@@ -79,7 +79,9 @@ class Prior:
             chosen = sorted(names[k] for k in pair)
         parts = [self._of_row(rng, name) for name in chosen]
         unknown = {"unknown": 1, "beside": 1, "unknowns": 2}.get(kind, 0)
-        of_unknown = rng.choice(len(self._terms.unknown), unknown, replace=False).tolist()
+        # what each arrival changes has a row where a quiet run shows it by chance
+        numbers = [k for k in range(len(self._terms.unknown)) if f"?{k}" != self._terms.arrivals]
+        of_unknown = rng.choice(numbers, unknown, replace=False).tolist()
         parts += [self._of_row(rng, f"?{number}") for number in of_unknown]
         if kind == "dwell":
             return DWELL, self._one_dwell(rng), {}
@@ -111,25 +113,24 @@ class Prior:
                 return [term.effect], _in_all(term, drawn, len(term.effect.coefficients))
             matrix = relations[int(rng.integers(len(relations)))]
             return [term.effect], matrix @ drawn[: matrix.shape[1]]
-        unknown = self._terms.unknown[int(term.row[1:])] if term.row.startswith("?") else None
-        if unknown is None or not term.summands:
-            return self._waves(rng, term, drawn, unknown is not None and "specific force" in unknown.driver)
-        texts = [(text, unknown.weight(k)) for k in term.summands for text in unknown.summands[k]]
-        effects = [self._terms.formula_of(text) for text, _ in texts]
-        weights = np.repeat([weight for _, weight in texts], [len(effect.coefficients) for effect in effects])
+        effects = self._terms.made_by(term)
+        if not term.summands:
+            return effects, self._without_formula(rng, term, drawn)
+        unknown = self._terms.unknown[int(term.row[1:])]
+        of_texts = [unknown.weight(k) for k in term.summands for _ in unknown.summands[k]]
+        weights = np.repeat(of_texts, [len(effect.coefficients) for effect in effects])
         rms = self._rms(effects)
         drawn = _in_all(term, drawn, len(rms))
         return effects, np.where(rms > 0.0, weights / np.where(rms > 0.0, rms, 1.0), 0.0) * drawn
 
-    def _waves(self, rng: np.random.Generator, term: RunTerm, drawn: Floats, of_scale: bool
-               ) -> tuple[list[Effect], Floats]:  # fmt: skip
-        """Return the waves of a term that is irregular in time, of one accelerometer alone or of all three, and their
-        coefficients. Where each has a size of its own, it is drawn: the term has the likeliest by its readings."""
+    def _without_formula(self, rng: np.random.Generator, term: RunTerm, drawn: Floats) -> Floats:
+        """Return the coefficients of what is irregular, of one accelerometer alone or of all three. Where each has a
+        size of its own, it is drawn: the term has the likeliest by its readings."""
         count = len(drawn) if term.only != EVERY else len(drawn) // 3
         scales = np.ones(len(drawn)) if term.scales is None else term.scales
         if len(drawn) > count and np.ptp(scales.reshape(3, -1), axis=0).any():
             scales = np.outer(10.0 ** rng.uniform(-2.0, 0.0, 3), scales.reshape(3, -1).max(axis=0)).ravel()
-        return [_Walk(self._dwells[-1].end_s, count, of_scale)], _in_all(term, drawn * scales, 3 * count)
+        return _in_all(term, drawn * scales, 3 * count)
 
     def _rms(self, effects: Sequence[Effect]) -> Floats:
         """Return the rms (C,) of the columns of effects, in units of the noise, as the terms are scaled."""
