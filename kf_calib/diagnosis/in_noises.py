@@ -23,6 +23,7 @@ from kf_calib.estimation.candidate_scan import SEEN
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
+_OF_CHI_SQUARED = 1e-13  # the same for each unit of chi-squared, of which a direction would gain what is rounding
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -79,6 +80,7 @@ class InNoises:
 
     - logs (K,): log of the restricted likelihood without any term.
     - along (K, C): G^T W z, projected off the model.
+    - rounding (K,): share of the square of a column below which what other columns leave of it is rounding.
     - lengths: of each group, the largest squares (K, n) of columns that were not projected.
     """
 
@@ -102,6 +104,7 @@ class InNoises:
         self._off = self._inverse @ products[:, :-1, self._spanned :]  # (K, k, C + 1)
         rest = products[:, -1, self._spanned :] - np.einsum("kpc,kp->kc", self._off, self._off[:, :, -1])
         self.along, chi2 = rest[:, :-1], rest[:, -1]
+        self.rounding = np.maximum(ROUNDING, _OF_CHI_SQUARED * chi2)
         log_model = np.log(np.einsum("kpp->kp", self._inverse)).sum(axis=1)
         self.logs = rows.log + 0.5 * np.log(self._weights).sum(axis=(1, 2)) + log_model - 0.5 * chi2
         self._groups, self._products = groups, sums
@@ -156,7 +159,8 @@ class InNoises:
 
     def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[Floats]:
         """What the columns (q,) of each group explain of all columns and of the readings, (K, q, C + 1) in K of the
-        sizes: products with an orthonormal basis of those columns that the model leaves, filled up with zeros."""
+        sizes: products with an orthonormal basis of those columns that the model leaves, filled up with zeros. It has
+        more directions than ``rounding`` leaves to a term: none of them is gained beside the group once more."""
         places, chosen = np.concatenate(groups), np.array(sizes, np.intp)
         columns = self._spanned + places
         products = np.zeros((len(chosen), len(places), self._rows.columns.shape[2] + 1))

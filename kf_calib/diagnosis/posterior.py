@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 
@@ -68,12 +68,14 @@ _NO_SIGN, _ONE = 0.5, 1e-3  # what is left of an effect beside one that is the s
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
-_NODES_OF_PAIR = 16  # sizes of each of two effects
+_NODES = {1: 16, 2: 16, 3: 8}  # sizes of each of so many effects
 _ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
 _AT_ONCE = 8  # sizes of noise, of which the products of all columns are copied
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 _Fitted = tuple[Hypothesis, Spanned, Courses]
+_Head = tuple[int, ...]
+_Rows = dict[frozenset[str], tuple[float, tuple[str, ...]]]
 
 
 class RunPosterior:
@@ -104,7 +106,7 @@ class RunPosterior:
         stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
         rows = [*self._without_terms(), *self._singles(), *self._dwells_apart()]
         if refitted:
-            rows = self._fitted(_merged([*rows, *self._pairs()]))
+            rows = self._fitted(_merged([*rows, *self._several()]))
             fitted = self._likeliest_fitted(rows)
             rows = _with_sure_dwells(self._with_changes_within(rows, fitted), self._dwells_beside(rows, fitted))
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
@@ -239,7 +241,7 @@ class RunPosterior:
         return {row: _log_sum(values) for row, values in of_row.items()}
 
     def _row_of(self, names: Sequence[str], log: float) -> Hypothesis:
-        """Return the row of some effects and, alone or beside one, an unknown function, with its prior."""
+        """Return the row of some effects and unknown functions, with its prior."""
         effects = tuple(each for name in names if not name.startswith("?") for each in self._run.effects_of(name))
         unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
         families = [self._effects[name].family for name in effects]
@@ -257,15 +259,17 @@ class RunPosterior:
 
     def _log_prior(self, effects: Sequence[str], functions: int = 0) -> float:
         """Return the log of the prior probability of some effects and unknown functions."""
-        causes, unknown = max(self._run.causes, 2), len(self._run.unknown)
+        causes, unknown = max(self._run.causes, 3), len(self._run.unknown)
         prior = math.prod(self._effects[name].prior for name in effects)
-        if functions == 2:
+        known = len(self._run.causes_of(effects))
+        if known + functions == 3:
+            kind, among = "three", 4 * math.comb(causes, known) * math.comb(unknown, functions)
+        elif functions == 2:
             kind, among = "unknowns", math.comb(unknown, 2)
         elif functions:
             kind, among = ("beside", causes * unknown) if effects else ("unknown", unknown)
         else:
-            is_one = len(self._run.causes_of(effects)) == 1
-            kind, among = ("effect", causes) if is_one else ("pair", math.comb(causes, 2))
+            kind, among = ("effect", causes) if known == 1 else ("pair", math.comb(causes, 2))
         return math.log(PRIOR[kind] * prior / among)
 
     def _tested(self, name: str) -> tuple[float, int]:
@@ -342,37 +346,89 @@ class RunPosterior:
         """Return the number of the unknown function of a row; None where it has none."""
         return next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
 
-    def _pairs(self) -> list[Hypothesis]:
+    def _several(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, and of the likeliest summands of unknown functions, each with any
-        other term beside it."""
-        terms, pairs = self._run.terms, dict[tuple[str, ...], float]()
-        if not (heads := [*self._heads(), *self._summands_to_pair()]):
-            return []
-        alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
+        other term beside it, and of the likeliest of these pairs with one more."""
+        terms, heads = self._run.terms, [(k,) for k in (*self._heads(), *self._summands_to_pair())]
+        alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for (k,) in heads]
+        pairs, found = _Rows(), list[tuple[_Head, Floats, Floats]]()
+        for head, likelihoods, logs in self._beside(heads, alone):
+            name, is_known = terms[head[0]].row, terms[head[0]].is_known
+            of_rows = self._by_row(logs)
+            if not is_known:
+                left = of_rows.get(self._run.arrivals, -math.inf) + math.log(_INEXACT)
+                both = float(np.logaddexp(self._of_two_summands(head[0], logs), left))
+                pairs[frozenset({name})] = both, (name,)
+            self._add_beside(pairs, head, of_rows)
+            found.append((head, likelihoods, logs))
+        alone_of = self._by_row(self._log_evidence)
+        alone_of |= {name: max(log, alone_of[name]) for log, (name, *others) in pairs.values() if not others}
+        for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
+            alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
+        rows = {key: self._row_beside(names, log, alone_of, pairs) for key, (log, names) in pairs.items()}
+        triples, several = _Rows(), self._pairs_to_extend(rows, found)
+        for head, _, logs in self._beside([head for head, _ in several], [alone for _, alone in several]):
+            self._add_beside(triples, head, self._by_row(logs))
+        return [*rows.values(), *(self._row_beside(names, log, alone_of, pairs) for log, names in triples.values())]
+
+    def _beside(self, heads: Sequence[_Head], alone: Sequence[Floats]) -> Iterator[tuple[_Head, Floats, Floats]]:
+        """Yield heads, some terms together each, with the log likelihoods (terms, noises) and log evidence (terms,) of
+        all terms beside them; alone: log likelihoods (noises,) of the heads."""
+        if not heads:
+            return
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
         explained = self._explained(heads, likely)
         for h, head in enumerate(heads):
-            name, is_known = terms[head].row, terms[head].is_known
-            stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
-            logs = np.repeat(alone[h][None], len(terms), axis=0)
+            names = [self._run.terms[k].row.replace("?", "unknown function ") for k in head]
+            stage.say(f"weighing all beside {listing(names)}")
+            logs = np.repeat(alone[h][None], len(self._run.terms), axis=0)
             for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
                 sizes = [k - first for k in likely[h][family]]
                 logs[:, likely[h][family]] += self._run.log_bayes(noises, sizes, explained[h, family])
-            logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
-            of_rows = self._by_row(logs)
-            if not is_known:
-                left = of_rows.get(self._run.arrivals, -math.inf) + math.log(_INEXACT)
-                pairs[(name,)] = float(np.logaddexp(self._of_two_summands(head, logs), left))
-            for other, log in of_rows.items():
-                key = (other, name) if (other, name) in pairs else (name, other)
-                if self._is_pair(name, other) and (is_known or other != self._run.arrivals):
-                    pairs[key] = max(pairs.get(key, -math.inf), log)
-        alone_of = self._by_row(self._log_evidence)
-        alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}
-        for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
-            alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
-        return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
+            yield head, logs, np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
+
+    def _add_beside(self, rows: _Rows, head: _Head, of_rows: dict[str, float]) -> None:
+        """Add the log evidence of rows of the terms of a head with one other row each, which may have come already."""
+        terms = [self._run.terms[k] for k in head]
+        for other, log in of_rows.items():
+            changes = other == self._run.arrivals and not all(term.is_known for term in terms)
+            if not changes and all(self._is_pair(term.row, other) for term in terms):
+                names = *(term.row for term in terms), other
+                before, names = rows.get(frozenset(names), (-math.inf, names))
+                rows[frozenset(names)] = max(before, log), names
+
+    def _row_beside(self, names: Sequence[str], log: float, alone: dict[str, float], pairs: _Rows) -> Hypothesis:
+        """Return a row where what effects gain beside unknown functions counts in part, as far as these explain more
+        than the effects do without them: no function is just one that is tried, and what it leaves is no noise of
+        independent dwells. What changes irregularly has no formula: it is noise, with which all of it counts."""
+        unknown = [name for name in names if name.startswith("?")]
+        known = [name for name in names if not name.startswith("?")]
+        functions = max((alone.get(name, -math.inf) for name in unknown), default=-math.inf)
+        effects = max((alone[name] for name in known), default=math.inf)
+        of_two = {key: both for key, (both, _) in pairs.items() if len(key) == 2}
+        functions = max(functions, of_two.get(frozenset(unknown), -math.inf))
+        effects = max(effects, of_two.get(frozenset(known), -math.inf))
+        log -= (1.0 - INDEPENDENT) * max(min(functions - effects, log - functions), 0.0)
+        return self._row_of(names, log)
+
+    def _pairs_to_extend(self, rows: dict[frozenset[str], Hypothesis], found: Sequence[tuple[_Head, Floats, Floats]]
+                         ) -> list[tuple[_Head, Floats]]:  # fmt: skip
+        """Return the terms of the likeliest pairs that explain more than any row of one term, the likeliest one of
+        effects alone among them, with their log likelihoods (noises,). What has no formula is tried beside pairs, and
+        no pair is made of it."""
+        terms, best = self._run.terms, dict[frozenset[str], tuple[float, _Head, Floats]]()
+        least = max((row.log_evidence for row in self._singles()), default=math.inf)
+        for (head,), likelihoods, logs in found:
+            for other, k in self._likeliest_of(logs, self._with_formula).items():
+                names = frozenset({terms[head].row, other})
+                row = rows.get(names) if len(names) == 2 else None
+                if row is not None and row.log_evidence > least and names not in best:
+                    best[names] = row.log_evidence, (head, k), likelihoods[k] + self._log_share_of(k)
+        likeliest = sorted(best.values(), key=lambda each: -each[0])
+        of_effects = [each for each in likeliest if all(terms[k].is_known for k in each[1])]
+        chosen = {head: alone for _, head, alone in (*likeliest[:_BESIDE], *of_effects[:1])}
+        return [*chosen.items()]
 
     def _is_pair(self, one: str, other: str) -> bool:
         """Tell whether two rows together are another explanation: neither is of a gimbal that the other has, nor are
@@ -396,10 +452,11 @@ class RunPosterior:
         share = math.log(unknown.share(2) / math.comb(len(others) + 1, 2))
         return _log_sum(logs[others].tolist()) - self._log_share_of(one) + share + head.log_share_of_form
 
-    def _explained(self, heads: Sequence[int], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
-        """Return what each term alone explains of all columns, in the noises of each family that are likely beside
-        it."""
-        groups = [self._run.terms[k].columns for k in heads]
+    def _explained(self, heads: Sequence[tuple[int, ...]], likely: Sequence[list[list[int]]]
+                   ) -> dict[tuple[int, int], Floats]:  # fmt: skip
+        """Return what the terms of each head explain of all columns, in the noises of each family that are likely
+        beside them."""
+        groups = [np.unique(np.concatenate([self._run.terms[k].columns for k in head])) for head in heads]
         explained = dict[tuple[int, int], Floats]()
         for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
             numbers = sorted({k for of_head in likely for k in of_head[family]})
@@ -443,8 +500,18 @@ class RunPosterior:
 
     def _likeliest(self, numbers: Iterable[int]) -> dict[str, int]:
         """Return the number of the likeliest of some terms of each row."""
-        least_first = sorted(numbers, key=lambda k: (float(self._log_evidence[k]), -k))
+        return self._likeliest_of(self._log_evidence, numbers)
+
+    def _likeliest_of(self, logs: Floats, numbers: Iterable[int]) -> dict[str, int]:
+        """Return the number of the likeliest of some terms of each row by log evidence (terms,)."""
+        least_first = sorted(numbers, key=lambda k: (float(logs[k]), -k))
         return {self._run.terms[k].row: k for k in least_first}
+
+    @cached_property
+    def _with_formula(self) -> list[int]:
+        """The numbers of terms of one effect, or of one summand of an unknown function."""
+        terms = enumerate(self._run.terms)
+        return [k for k, term in terms if len(term.summands) == 1 or (term.is_known and term.row != self._run.walk)]
 
     def _log_share_of(self, k: int) -> float:
         """Return the log of the mean likelihood of an effect, in one accelerometer or in all as a term has it, over
@@ -487,15 +554,16 @@ class RunPosterior:
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
     def _to_be_fitted(self, rows: Sequence[Hypothesis]) -> set[int]:
-        """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
-        beside effects, of these alone and of their likeliest pairs: beside each other, constants are others than
-        alone, but for a random walk, which has none."""
+        """Return the ids of the likeliest row, if it is of effects and not fitted; where that has an unknown function,
+        or a random walk, of its effects alone, and of the likeliest others with them: beside each other, constants are
+        others than alone, but for a random walk, and a function of any form, which have none."""
         first, *others = sorted(rows, key=lambda row: -row.log_evidence)
-        likeliest = [first]
-        if first.driver:
-            known = [row for row in others if first.effects and not row.driver]
-            pairs = [row for row in known if {*first.effects} < {*row.effects} and self._run.walk not in row.effects]
-            likeliest = [*(row for row in known if {*row.effects} == {*first.effects}), *pairs[:_BESIDE]]
+        likeliest, kept = [] if first.driver else [first], {*first.effects} - {self._run.walk}
+        if first.driver or kept != {*first.effects}:
+            known = [row for row in others if row.effects and not row.driver]
+            likeliest += [row for row in known if {*row.effects} == {*first.effects}]
+            wider = [row for row in known if kept < {*row.effects} and self._run.walk not in row.effects]
+            likeliest += wider[:_BESIDE]
         return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
     def _without_refused(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -568,7 +636,7 @@ class RunPosterior:
         related = [*itertools.product(*map(_relations, causes))]
         usual = [(usual_sizes(cause[0], self._run.grade), impossible_size(cause[0])) for cause in causes]
         sizes = [
-            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), *prior, _NODES_OF_PAIR)
+            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), *prior, _NODES[len(causes)])
              for place, (_, matrix), prior in zip(places, relation, usual, strict=True)]
             for relation in related
         ]  # fmt: skip
@@ -650,15 +718,6 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
-
-
-def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:
-    """Return the log evidence of a row where what an effect gains beside an unknown function counts in part, as far as
-    this explains more alone: no function is just one that is tried, and what it leaves is no noise of independent
-    dwells. What changes irregularly has no formula: it is noise, with which all of it counts."""
-    function = max((alone.get(name, -math.inf) for name in names if name.startswith("?")), default=-math.inf)
-    effect = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
-    return log - (1.0 - INDEPENDENT) * max(min(function - effect, log - function), 0.0)
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:

@@ -338,14 +338,14 @@ def _off(
     return off, to_states, along, onto
 
 
-def _eigen(gram: Floats, lengths: Floats | None) -> tuple[Floats, Floats, Floats]:
+def _eigen(gram: Floats, lengths: Floats | None, rounding: Floats | float) -> tuple[Floats, Floats, Floats]:
     """Return the roots (..., n) of the largest squares of columns, and the eigenvalues (..., n, q) and vectors
     (..., n, q, q) of gram (..., n, q, q) in units of these squares; arguments as of ``log_bayes``."""
     largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
     scales = np.sqrt(np.maximum(largest, 1e-300))
     scaled = gram / scales[..., None, None] ** 2
     values, vectors = _eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
-    return scales, np.where(values > ROUNDING, values, 0.0), vectors
+    return scales, np.where(values > np.expand_dims(rounding, -1), values, 0.0), vectors
 
 
 def _eigh(gram: Floats) -> tuple[Floats, Floats]:
@@ -365,14 +365,15 @@ def _eigh(gram: Floats) -> tuple[Floats, Floats]:
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,
-              lengths: Floats | None = None) -> Floats:  # fmt: skip
+              lengths: Floats | None = None, rounding: Floats | float = ROUNDING) -> Floats:  # fmt: skip
     """Log Bayes factors (..., n) of n terms of q columns, in several noises or one: gram (..., n, q, q) and along
     (..., n, q) = G^T z, each averaged over its sizes, of which the squares (..., n, m), the logs (n, m) of their
     probabilities and the centres (n,) are given.
 
     lengths: the largest squares (..., n) of columns before others were subtracted from them; None: those of gram.
+    rounding (..., 1): share of these that is rounding.
     """
-    scales, values, vectors = _eigen(gram, lengths)
+    scales, values, vectors = _eigen(gram, lengths, rounding)
     shifted, shift = along, 0.0
     if centres.any():
         shifted = along - gram.sum(axis=-1) * centres[:, None]
@@ -390,18 +391,19 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
     return log_of_sum(log_weights + 0.5 * (squares * gained - log_volume)) + shift
 
 
-def orthonormal_columns(gram: Floats, along: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
+def orthonormal_columns(gram: Floats, along: Floats, lengths: Floats, rounding: Floats
+                        ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """The orthonormal columns U that the columns G of terms are turned to: the squares (..., n, q) L of those of which
     they are a part, G = U L^(1/2) T^T, the matrices T L^(-1/2) (..., n, q, q), and U^T z (..., n, q); arguments as of
     ``log_bayes``."""
-    scales, values, vectors = _eigen(gram, lengths)
+    scales, values, vectors = _eigen(gram, lengths, rounding)
     units = np.where(values > 0.0, 1.0 / np.sqrt(np.where(values > 0.0, values, 1.0)), 0.0) / scales[..., None]
     turns = vectors * units[..., None, :]
     return values * scales[..., None] ** 2, turns, (along[..., None, :] @ turns)[..., 0, :]
 
 
 def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: Floats, readings: Floats,
-                     squares: Floats, log_weights: Floats) -> Floats:  # fmt: skip
+                     squares: Floats, log_weights: Floats, rounding: Floats) -> Floats:  # fmt: skip
     """The same beside f columns of any size, of which B is an orthonormal basis: explained (K, n, q, f) = G^T B and
     readings (K, f) = B^T z; squared, turns and along are the terms' ``orthonormal_columns``.
 
@@ -409,7 +411,8 @@ def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: F
 
       1/2 (z^T (I - V^-1) z + h^T M^-1 h - |B^T z|^2) - 1/2 log det V - 1/2 log det M,
 
-    so that for each size there is a matrix of f rows only. What of B lies in U is known to the root of ``ROUNDING``.
+    so that for each size there is a matrix of f rows only. What of B lies in U is known to the root of ``rounding``
+    (K, 1).
     """
     common = np.swapaxes(turns, -1, -2) @ explained
     apart, axes = np.linalg.eigh(np.eye(common.shape[-1]) - np.swapaxes(common, -1, -2) @ common)
@@ -417,7 +420,7 @@ def log_bayes_beside(squared: Floats, turns: Floats, along: Floats, explained: F
     left = 1.0 / (1.0 + squares[..., None] * squared[..., None, :])
     pairs = (common[..., None] * common[..., None, :]).reshape(*common.shape[:-1], common.shape[-1] ** 2)
     matrices = (left @ pairs).reshape(*left.shape[:-1], *axes.shape[-2:])
-    matrices += (np.maximum(apart, math.sqrt(ROUNDING))[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
+    matrices += (np.maximum(apart, np.sqrt(rounding)[..., None])[..., None] * np.eye(apart.shape[-1]))[..., None, :, :]
     of_rest = readings - (along[..., None, :] @ common)[..., 0, :]
     right = of_rest[..., None, :] + left @ (common * along[..., None])
     roots = np.linalg.cholesky(matrices)

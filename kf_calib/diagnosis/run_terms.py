@@ -447,19 +447,20 @@ class RunTerms:
         """Return the log Bayes factors (K, n) of the terms that are alike."""
         alike = self._alike[number]
         squares, log_weights, centres = alike.squares, alike.log_weights, alike.centres
+        rounding = noises.rounding[sizes][:, None]
         if explained is None:
             gram, along, lengths = self._products(noises, number, sizes)
-            return log_bayes(gram, along, squares, log_weights, centres, lengths)
+            return log_bayes(gram, along, squares, log_weights, centres, lengths, rounding)
         parts = explained[..., alike.places[alike.which]] * alike.scales
         parts = np.moveaxis(parts, 1, 3)  # (K, n, q, f)
         if parts.shape[2] >= _WIDE and not centres.any():
             decomposed = zip(*(self._decomposed(noises, number, k) for k in sizes), strict=True)
             squared, turns, along = map(np.concatenate, decomposed)
-            return log_bayes_beside(squared, turns, along, parts, explained[..., -1], squares, log_weights)
+            return log_bayes_beside(squared, turns, along, parts, explained[..., -1], squares, log_weights, rounding)
         gram, along, lengths = self._products(noises, number, sizes)
         gram -= parts @ np.swapaxes(parts, 2, 3)
         along -= (parts @ explained[:, None, :, -1:])[..., 0]
-        return log_bayes(gram, along, squares, log_weights, centres, lengths)
+        return log_bayes(gram, along, squares, log_weights, centres, lengths, rounding)
 
     def _products(self, noises: InNoises, number: int, sizes: Sequence[int]) -> tuple[Floats, Floats, Floats]:
         """Return G^T W G (K, n, q, q) and G^T W z (K, n, q) of the terms that are alike, and the largest squares (K, n)
@@ -476,7 +477,9 @@ class RunTerms:
         they are tried beside."""
         key = noises, number, size
         if key not in self._decompositions:
-            self._decompositions[key] = orthonormal_columns(*self._products(noises, number, [size]))
+            self._decompositions[key] = orthonormal_columns(
+                *self._products(noises, number, [size]), noises.rounding[[size]][:, None]
+            )
         return self._decompositions[key]
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:

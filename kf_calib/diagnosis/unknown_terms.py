@@ -145,7 +145,7 @@ def _varies(dwells: Sequence[Dwell]) -> bool:
 def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
     """slow: what changes slowly, in words and as formulas have it."""
     for k in range(1, count + 1):
-        waves = {n: _waves(_turned(n, k)) for n in (1, 2, 3, 4, 6)}
+        waves = {n: _waves(_turned(n, k)) for n in (1, 2, 3, 4, 5, 6)}
         cage = _waves(f"{_CAGE}*q{k}")
         weights = [n**-0.5 for n in waves]
         yield _term(f"angle of gimbal {k}", "", [(f"q{k}",), *waves.values()], (1.0, *weights))

@@ -45,11 +45,11 @@ def test_noise_of_few_poses_is_no_effect(seed: int, faces: bool, stated: bool) -
         assert found.missing == () and found.test.consistent is not False, found.verdict
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
+@pytest.mark.parametrize("stated", [False, *slow(True)])
+@pytest.mark.parametrize("seed", [3, *slow(0, 1, 2)])
 def test_six_faces_do_not_tell_what_is_the_same_there(seed: int, stated: bool) -> None:
-    """It was an eccentric encoder with 95 %, or one dwell that was wrong (p < 1e-300)."""
+    """It was an eccentric encoder with 95 %, or one dwell that was wrong (p < 1e-300), or two unknown functions that
+    together explained by 357 in log likelihood more than there is."""
     found = diagnosed(seed, 6, second=1e-3, stated=stated, faces=True)
     assert found.test.consistent is False and disturbed_dwells(found) == []
     assert found.table is not None and {"second-order", "scale-asymmetry"} <= {*found.ambiguity}

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from helpers.independent_bench import BENCH, DWELL_S, ROBOT, SLEW_S, Error, IndependentBench, State
 from helpers.long_runs import slow
+from scipy.spatial.transform import Rotation
 from unknown_trials.faulty_bench import faulty_run
 
 import kf_calib
 from kf_calib.bench.bench import Bench
 from kf_calib.diagnosis.candidate_tests import assess_candidates
+from kf_calib.diagnosis.hypothesis_table import AS_WELL
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import Settings, calibrate
@@ -135,7 +137,8 @@ def twice(state: State) -> np.ndarray:
 def test_what_no_effect_of_the_catalogue_is_gets_no_name(driver: str) -> None:
     diagnosis = diagnosed(IndependentBench(5, **OTHERS[driver]))
     assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
-    assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == driver
+    # a large one may have a second function for what the neighbouring frequencies leave of it
+    assert diagnosis.likeliest is not None and driver in diagnosis.likeliest.driver.split(AS_WELL)
 
 
 @pytest.mark.slow
@@ -368,6 +371,22 @@ def test_constants_of_two_effects_are_those_beside_each_other() -> None:
     for symbol in ("tauWarm", "tauScale"):
         found = diagnosis.after.parameters[symbol]
         assert abs(found.value - 100.0) < 4.0 * found.sigma < 100.0
+
+
+@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4)])
+def test_three_effects_at_once_are_named(seed: int) -> None:
+    """Two of them and a walk of the biases were named with 99 %, or the rest was unknown."""
+
+    def bias(state: State) -> np.ndarray:
+        along = Rotation.from_euler("YZX", state.angles_rad).inv().apply([0.0, 1.0, 0.0])
+        warm = 3e-4 * np.exp(-state.time_s / 100.0)[:, None] * np.eye(3)[1]
+        return 2e-4 * along**2 * np.eye(3)[2] + 2e-4 * np.sign(along) * np.eye(3)[0] + warm
+
+    diagnosis = diagnosed(IndependentBench(seed, 36, bias=bias))
+    assert {*diagnosis.missing} == {"second-order", "bias-asymmetry", "warm-up"}, diagnosis.verdict
+    assert diagnosis.after is not None
+    found = diagnosis.after.parameters["tauWarm"]
+    assert abs(found.value - 100.0) < 4.0 * found.sigma < 50.0
 
 
 @pytest.mark.slow
