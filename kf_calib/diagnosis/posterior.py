@@ -351,7 +351,7 @@ class RunPosterior:
         other term beside it, and of the likeliest of these pairs with one more."""
         terms, heads = self._run.terms, [(k,) for k in (*self._heads(), *self._summands_to_pair())]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for (k,) in heads]
-        pairs, found = _Rows(), list[tuple[_Head, Floats, Floats]]()
+        pairs, beside = _Rows(), list[tuple[_Head, Floats, Floats]]()
         for head, likelihoods, logs in self._beside(heads, alone):
             name, is_known = terms[head[0]].row, terms[head[0]].is_known
             of_rows = self._by_row(logs)
@@ -360,13 +360,13 @@ class RunPosterior:
                 both = float(np.logaddexp(self._of_two_summands(head[0], logs), left))
                 pairs[frozenset({name})] = both, (name,)
             self._add_beside(pairs, head, of_rows)
-            found.append((head, likelihoods, logs))
+            beside.append((head, likelihoods, logs))
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for log, (name, *others) in pairs.values() if not others}
         for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
             alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
         rows = {key: self._row_beside(names, log, alone_of, pairs) for key, (log, names) in pairs.items()}
-        triples, several = _Rows(), self._pairs_to_extend(rows, found)
+        triples, several = _Rows(), self._pairs_to_extend(rows, beside)
         for head, _, logs in self._beside([head for head, _ in several], [alone for _, alone in several]):
             self._add_beside(triples, head, self._by_row(logs))
         return [*rows.values(), *(self._row_beside(names, log, alone_of, pairs) for log, names in triples.values())]
@@ -406,20 +406,21 @@ class RunPosterior:
         known = [name for name in names if not name.startswith("?")]
         functions = max((alone.get(name, -math.inf) for name in unknown), default=-math.inf)
         effects = max((alone[name] for name in known), default=math.inf)
-        of_two = {key: both for key, (both, _) in pairs.items() if len(key) == 2}
-        functions = max(functions, of_two.get(frozenset(unknown), -math.inf))
-        effects = max(effects, of_two.get(frozenset(known), -math.inf))
+        if len(unknown) > 1:
+            functions = max(functions, pairs.get(frozenset(unknown), (-math.inf,))[0])
+        if len(known) > 1:
+            effects = max(effects, pairs.get(frozenset(known), (-math.inf,))[0])
         log -= (1.0 - INDEPENDENT) * max(min(functions - effects, log - functions), 0.0)
         return self._row_of(names, log)
 
-    def _pairs_to_extend(self, rows: dict[frozenset[str], Hypothesis], found: Sequence[tuple[_Head, Floats, Floats]]
+    def _pairs_to_extend(self, rows: dict[frozenset[str], Hypothesis], beside: Sequence[tuple[_Head, Floats, Floats]]
                          ) -> list[tuple[_Head, Floats]]:  # fmt: skip
         """Return the terms of the likeliest pairs that explain more than any row of one term, the likeliest one of
         effects alone among them, with their log likelihoods (noises,). What has no formula is tried beside pairs, and
         no pair is made of it."""
         terms, best = self._run.terms, dict[frozenset[str], tuple[float, _Head, Floats]]()
         least = max((row.log_evidence for row in self._singles()), default=math.inf)
-        for (head,), likelihoods, logs in found:
+        for (head,), likelihoods, logs in beside:
             for other, k in self._likeliest_of(logs, self._with_formula).items():
                 names = frozenset({terms[head].row, other})
                 row = rows.get(names) if len(names) == 2 else None

@@ -9,6 +9,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from kf_calib.diagnosis.candidate_tests import assess_candidates
+from kf_calib.diagnosis.in_noises import ROUNDING
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.posterior import RunPosterior, _gains, _likeliest
 from kf_calib.diagnosis.refits import Refits
@@ -27,6 +28,8 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_column
 from kf_calib.noise.means import means_of
 from kf_calib.noise.reml import with_shared_noise
 from kf_calib.noise.terms import WavesOverRun
+
+ROUNDED = np.full((1, 1), ROUNDING)
 
 
 def sizes(*values: float) -> Sizes:
@@ -249,8 +252,8 @@ def test_evidence_beside_others_is_that_of_what_they_leave(common: int) -> None:
     basis = np.linalg.qr(beside)[0]
     left = columns - basis @ (basis.T @ columns)
     squares, logs, lengths = np.geomspace(1e-4, 1e4, 9)[None], np.full((1, 9), -np.log(9.0)), np.full((1, 1), 90.0)
-    terms = orthonormal_columns((columns.T @ columns)[None, None], (columns.T @ z)[None, None], lengths)
-    found = log_bayes_beside(*terms, (columns.T @ basis)[None, None], (basis.T @ z)[None], squares, logs)
+    terms = orthonormal_columns((columns.T @ columns)[None, None], (columns.T @ z)[None, None], lengths, ROUNDED)
+    found = log_bayes_beside(*terms, (columns.T @ basis)[None, None], (basis.T @ z)[None], squares, logs, ROUNDED)
     gram, along = (left.T @ left)[None, None], (left.T @ z)[None, None]
     assert found == pytest.approx(log_bayes(gram, along, squares, logs, np.zeros(1), lengths), abs=1e-3)
 
@@ -266,8 +269,10 @@ def test_columns_that_others_have_whole_explain_nothing_beside_them() -> None:
     )
     left, rest = columns - basis @ (basis.T @ columns), z - basis @ (basis.T @ z)
     squares, logs = np.geomspace(1e-6, 1e14, 11)[None], np.full((1, 11), -np.log(11.0))
-    terms = orthonormal_columns((columns.T @ columns)[None, None], (columns.T @ z)[None, None], np.ones((1, 1)))
-    found = log_bayes_beside(*terms, (columns.T @ basis)[None, None], (basis.T @ z)[None], squares, logs)
+    terms = orthonormal_columns(
+        (columns.T @ columns)[None, None], (columns.T @ z)[None, None], np.ones((1, 1)), ROUNDED
+    )
+    found = log_bayes_beside(*terms, (columns.T @ basis)[None, None], (basis.T @ z)[None], squares, logs, ROUNDED)
     turned, sizes, _ = np.linalg.svd(left, full_matrices=False)
     spreads = 1.0 + squares[0][:, None] * np.where(sizes > 1e-5, sizes, 0.0) ** 2
     expected = 0.5 * np.sum((turned.T @ rest) ** 2 * (1.0 - 1.0 / spreads) - np.log(spreads), axis=1)
