@@ -415,20 +415,26 @@ class RunPosterior:
 
     def _pairs_to_extend(self, rows: dict[frozenset[str], Hypothesis], beside: Sequence[tuple[_Head, Floats, Floats]]
                          ) -> list[tuple[_Head, Floats]]:  # fmt: skip
-        """Return the terms of the likeliest pairs that explain more than any row of one term, the likeliest one of
-        effects alone among them, with their log likelihoods (noises,). What has no formula is tried beside pairs, and
-        no pair is made of it."""
-        terms, best = self._run.terms, dict[frozenset[str], tuple[float, _Head, Floats]]()
-        least = max((row.log_evidence for row in self._singles()), default=math.inf)
+        """Return the terms of the likeliest pairs, and of the likeliest of effects alone, in noise that is averaged
+        over and in that stated, which explain more than any such row of one term, with their log likelihoods (noises,).
+        What has no formula is tried beside pairs, and no pair is made of it."""
+        terms, best = self._run.terms, dict[frozenset[str], tuple[float, float, _Head, Floats]]()
         for (head,), likelihoods, logs in beside:
             for other, k in self._likeliest_of(logs, self._with_formula).items():
                 names = frozenset({terms[head].row, other})
                 row = rows.get(names) if len(names) == 2 else None
-                if row is not None and row.log_evidence > least and names not in best:
-                    best[names] = row.log_evidence, (head, k), likelihoods[k] + self._log_share_of(k)
-        likeliest = sorted(best.values(), key=lambda each: -each[0])
-        of_effects = [each for each in likeliest if all(terms[k].is_known for k in each[1])]
-        chosen = {head: alone for _, head, alone in (*likeliest[:_BESIDE], *of_effects[:1])}
+                if row is not None and names not in best:
+                    alone = likelihoods[k] + self._log_share_of(k)
+                    best[names] = row.log_evidence, float(likelihoods[k, 0]), (head, k), alone
+        chosen, stated = dict[_Head, Floats](), self._base[0] + self._log_bayes[:, 0]
+        for known in ({True, False}, {True}):
+            single = [row.log_evidence for row in self._singles() if bool(row.effects) in known]
+            least = max(single, default=math.inf)
+            of_stated = max((stated[k] for k, term in enumerate(terms) if term.is_known in known), default=math.inf)
+            among = [each for each in best.values() if {terms[k].is_known for k in each[2]} <= known]
+            likeliest = sorted((each for each in among if each[0] > least), key=lambda each: -each[0])[:_HEADS]
+            largest = sorted((each for each in among if each[1] > of_stated + _BEHIND), key=lambda each: -each[1])
+            chosen |= {head: alone for *_, head, alone in (*likeliest, *largest[:_HEADS])}
         return [*chosen.items()]
 
     def _is_pair(self, one: str, other: str) -> bool:
@@ -555,13 +561,15 @@ class RunPosterior:
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
     def _to_be_fitted(self, rows: Sequence[Hypothesis]) -> set[int]:
-        """Return the ids of the likeliest row, if it is of effects and not fitted; where that has an unknown function,
-        or a random walk, of its effects alone, and of the likeliest others with them: beside each other, constants are
-        others than alone, but for a random walk, and a function of any form, which have none."""
+        """Return the ids of the likeliest row, if it is of effects and not fitted, and of pairs of its effects; where
+        it has an unknown function, or a random walk, of its effects alone, and of the likeliest others with them:
+        beside each other, constants are others than alone, but for a random walk, and a function of any form, which
+        have none."""
         first, *others = sorted(rows, key=lambda row: -row.log_evidence)
         likeliest, kept = [] if first.driver else [first], {*first.effects} - {self._run.walk}
+        known = [row for row in others if row.effects and not row.driver]
+        likeliest += [row for row in known if {*row.effects} < {*first.effects} and len(row.effects) > 1]
         if first.driver or kept != {*first.effects}:
-            known = [row for row in others if row.effects and not row.driver]
             likeliest += [row for row in known if {*row.effects} == {*first.effects}]
             wider = [row for row in known if kept < {*row.effects} and self._run.walk not in row.effects]
             likeliest += wider[:_BESIDE]
