@@ -26,6 +26,9 @@ from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.noise.means import means_of
 
 NOTHING, NOISE, UNKNOWN, DWELL = "nothing", "noise", "unknown", "one dwell"
+_COUNTS = {"effect": (1, 0), "pair": (2, 0), "unknown": (0, 1), "beside": (1, 1), "unknowns": (0, 2)}
+"""Effects and unknown functions of each kind of explanation; three may be any of them."""
+
 _NOISE_RANGE = (0.1, 100.0)  # of noise from dwell to dwell, in that which was stated
 _LARGEST = 3000.0  # root of chi-squared of an explanation: a larger one is drawn again, since it is far from linear
 
@@ -70,15 +73,13 @@ class Prior:
         kind = _one_of(rng, [*PRIOR], [*PRIOR.values()])
         names, nothing = self._terms.names, np.zeros((len(self._dwells.folded.pieces), 3, 3))
         weights = [effect_named(name, self._terms.bench).prior for name in names]
-        chosen: list[str] = []
-        if kind in {"effect", "beside"}:
-            chosen = [_one_of(rng, names, weights)]
-        elif kind == "pair":
-            pairs = [*itertools.combinations(range(len(names)), 2)]
-            pair = _one_of(rng, pairs, [weights[i] * weights[j] for i, j in pairs])
-            chosen = sorted(names[k] for k in pair)
+        known, unknown = _COUNTS.get(kind, (0, 0))
+        if kind == "three":
+            known = int(rng.integers(4))
+            unknown = 3 - known
+        sets = [*itertools.combinations(range(len(names)), known)]
+        chosen = sorted(names[k] for k in _one_of(rng, sets, [math.prod(weights[k] for k in each) for each in sets]))
         parts = [self._of_row(rng, name) for name in chosen]
-        unknown = {"unknown": 1, "beside": 1, "unknowns": 2}.get(kind, 0)
         # what each arrival changes has a row where a quiet run shows it by chance
         numbers = [k for k in range(len(self._terms.unknown)) if f"?{k}" != self._terms.arrivals]
         of_unknown = rng.choice(numbers, unknown, replace=False).tolist()
