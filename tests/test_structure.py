@@ -195,7 +195,7 @@ CEILINGS = {
     "noise": 3406,
     "estimation": 7948,
     "design": 1879,
-    "diagnosis": 6400,
+    "diagnosis": 6399,
     "online": 1631,
     "exchange": 1964,
     "views": 6907,

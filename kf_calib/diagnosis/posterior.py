@@ -426,10 +426,9 @@ class RunPosterior:
                 if row is not None and names not in best:
                     alone = likelihoods[k] + self._log_share_of(k)
                     best[names] = row.log_evidence, float(likelihoods[k, 0]), (head, k), alone
-        chosen, stated = dict[_Head, Floats](), self._base[0] + self._log_bayes[:, 0]
+        chosen, singles, stated = dict[_Head, Floats](), self._singles(), self._base[0] + self._log_bayes[:, 0]
         for known in ({True, False}, {True}):
-            single = [row.log_evidence for row in self._singles() if bool(row.effects) in known]
-            least = max(single, default=math.inf)
+            least = max((row.log_evidence for row in singles if bool(row.effects) in known), default=math.inf)
             of_stated = max((stated[k] for k, term in enumerate(terms) if term.is_known in known), default=math.inf)
             among = [each for each in best.values() if {terms[k].is_known for k in each[2]} <= known]
             likeliest = sorted((each for each in among if each[0] > least), key=lambda each: -each[0])[:_HEADS]
