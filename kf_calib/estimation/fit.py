@@ -15,7 +15,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import RotationEffect
-from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, steps
@@ -149,8 +149,6 @@ class Fit:
         of_run = self.noise.columns("run", linearised.dwells_at_state, linearised.state)
         if of_run.shape[3]:
             information += self._considered(OfPieces(of_run, self.dwells.folded.ends))
-        if not linearised.model.bench.angles and linearised.model.effects:
-            information += self._considered(free_attitude.triad_changes(linearised))
         for known in linearised.model.known:
             columns = candidate_columns(
                 linearised.dwells_at_state, [known.effect], linearised.model.bench, linearised.state

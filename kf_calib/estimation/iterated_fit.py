@@ -170,6 +170,8 @@ def _noise_at(linearised: LinearisedDwells, within: Noise, components: VarianceC
     sensitivity = _sensitivity_to_temperature(linearised, within)
     within = within.without(ThermometerError)
     within = within if sensitivity is None else within.with_terms(ThermometerError(sensitivity))
+    if linearised.model.effects and not linearised.model.bench.angles:
+        within = within.with_terms(free_attitude.BlockAxes(linearised.model, linearised.state))
     means, prior = with_shared_noise(linearised.dwells, within, linearised.means, linearised.state)
     if roughly and not prior.size:
         means = means[:: max(len(means.counts) // _MANY, 1)]
