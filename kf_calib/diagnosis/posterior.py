@@ -49,7 +49,7 @@ from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.estimation.free_attitude import BlockAxes
+from kf_calib.estimation.axes_across import AxesAcross
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
@@ -667,7 +667,7 @@ class RunPosterior:
         has in addition, with G^T W G (k, q, q) and G^T W z (k, q) of their columns."""
         key = tuple(map(str, refit.model.effects))
         if key not in self._of_refits:
-            known, added = self._before.model.count, map(refit.noise.term, (ThermometerError, BlockAxes))
+            known, added = self._before.model.count, map(refit.noise.term, (ThermometerError, AxesAcross))
             noise = self._noise.with_terms(*(term for term in added if term is not None))
             likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
             every = np.arange(refit.model.count - known)

@@ -201,8 +201,7 @@ def _unexplained(diagnosis: Diagnosis, first: Hypothesis) -> str:
     if consistency.consistent is not False:
         return ""
     if consistency.trend is not None:
-        dwell, channel = consistency.trend.most
-        where = f"most in dwell {dwell}, accelerometer {channel}"
+        where = consistency.trend.most_in_words
         return f"; the readings change within dwells, too, {where} (p {format_p(consistency.p_value)})"
     known = [f"{names} {share}" for names, share in _known_beside(diagnosis, first)]
     likeliest = f", likeliest {', '.join(known)}" if known else ""
@@ -255,8 +254,7 @@ def _within(diagnosis: Diagnosis) -> str:
     trend = diagnosis.test.trend
     if trend is None or trend.run_p >= LEVEL:
         return ""
-    dwell, channel = trend.most
-    return f" The readings change within dwells, too, most in dwell {dwell}, accelerometer {channel}."
+    return f" The readings change within dwells, too, {trend.most_in_words}."
 
 
 def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:

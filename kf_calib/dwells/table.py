@@ -218,7 +218,7 @@ class FoldedDwells:
     def at_nodes(self, values: Floats) -> OfPieces:
         """Columns (pieces, K nodes, 3, c) of all dwells from values (m, 3, c) at their nodes; zeros on a carrier."""
         columns = np.zeros((self.ends[-1], self.width, *values.shape[1:]))
-        columns[:, :3] = values.reshape(-1, 3, *values.shape[1:])
+        columns[:, :3] = values.reshape(len(columns), 3, *values.shape[1:])
         return OfPieces(columns, self.ends)
 
     def weighted(self, of_pieces: Floats) -> Floats:

@@ -13,25 +13,19 @@ square, and the uncertainty of that enters the covariance (considered parameters
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
-from kf_calib.bench.arrays import DIFFERENCE, Floats
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
-from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import HOPELESS
 from kf_calib.estimation.kalman_filterpy import Samples
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.terms import NoiseTerm, Scope
 
 DIRECTIONS: dict[str, Floats] = {
     " ".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, "xyz", strict=True) if sign): (
@@ -115,47 +109,6 @@ def square_sigmas(model: Model, state: Floats) -> Floats | None:
     for channel, axis in (divmod(SQUARE[angle], 4) for angle in model.square):
         sigmas[channel, axis] = affine[channel, channel] * model.bench.square_rad
     return sigmas if model.square else None
-
-
-@dataclass(frozen=True)
-class BlockAxes(NoiseTerm):
-    """Where the pendulous and output axes lie: in the frame of the block, which is not that of the sensors.
-
-    The two differ by as much as the input axes do from a square. Each error turns these axes of all effects of the
-    ``model`` by 1 sigma about an axis of the frame, and so changes the readings in proportion to what the effects are,
-    as they are at ``state`` (p,). With square axes, |f| does not tell the three coefficients of some effects from each
-    other; what else would is no more than this uncertainty.
-    """
-
-    model: Model
-    state: Floats
-    scope: ClassVar[Scope] = "run"
-
-    @property
-    def sizes(self) -> Floats:
-        unit = self._sensitivity / np.linalg.norm(self._sensitivity, axis=1, keepdims=True)
-        off_square = math.sqrt(float(np.mean((unit @ unit.T)[np.triu_indices(3, 1)] ** 2)))
-        return np.array([max(self.model.bench.square_rad, off_square)])
-
-    @property
-    def _sensitivity(self) -> Floats:
-        return self.state[:STATE_COUNT].reshape(3, 4)[:, :3]
-
-    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
-        del state
-        effects, stimulus = bent_effects(self.model, self.state), stimulus_of(dwells, self.model.bench, self.state)
-        changes = np.zeros((len(stimulus), 3, 3))
-        for axis in range(3):
-            ends = list[Floats]()
-            for sign in (1.0, -1.0):
-                turn = matrix_of(sign * DIFFERENCE * np.eye(3)[axis])
-                turned = replace(
-                    stimulus, force_mps2=stimulus.force_mps2 @ turn.T, sensitivity=self._sensitivity @ turn.T,
-                    previous_force_mps2=stimulus.previous_force_mps2 @ turn.T,
-                )  # fmt: skip
-                ends.append(added_by(effects, turned, self.model, self.state))
-            changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * self.sizes / DIFFERENCE)
-        return dwells.folded.at_nodes(changes).values
 
 
 def undetermined(covariance: Floats) -> list[str]:

@@ -35,6 +35,7 @@ from kf_calib.estimation.attitude import (
     relinearised,
     without_attitudes,
 )
+from kf_calib.estimation.axes_across import AxesAcross
 from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature, stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
@@ -170,8 +171,8 @@ def _noise_at(linearised: LinearisedDwells, within: Noise, components: VarianceC
     sensitivity = _sensitivity_to_temperature(linearised, within)
     within = within.without(ThermometerError)
     within = within if sensitivity is None else within.with_terms(ThermometerError(sensitivity))
-    if linearised.model.effects and not linearised.model.bench.angles:
-        within = within.with_terms(free_attitude.BlockAxes(linearised.model, linearised.state))
+    if linearised.model.effects:
+        within = within.with_terms(AxesAcross(linearised.model, linearised.state))
     means, prior = with_shared_noise(linearised.dwells, within, linearised.means, linearised.state)
     if roughly and not prior.size:
         means = means[:: max(len(means.counts) // _MANY, 1)]

@@ -33,10 +33,9 @@ MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: a
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
     """A sentence on what may be wrong if the dwells do not fit the model, from residuals (D, 3); '' if they fit."""
     if judged.trend is not None:
-        dwell, channel = judged.trend.most
         return (
             f"the readings change within dwells by {judged.trend.ratio:.2f} times the power of noise (p "
-            f"{format_p(judged.trend.p_value)}), most in dwell {dwell}, accelerometer {channel}: something disturbed "
+            f"{format_p(judged.trend.p_value)}), {judged.trend.most_in_words}: something disturbed "
             "it, or an effect that shows within dwells is missing; diagnose tells which."
         )
     rms = float(np.sqrt(np.mean(residuals**2)))

@@ -32,6 +32,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import scale_columns
 from kf_calib.estimation.whitened_rows import misfit_rows
 from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.rotations import along_force, sensitivities_of
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support.tail_probabilities import LEVEL, REST, chi_squared_tail, f_tail, sidak
 
@@ -72,9 +73,10 @@ def _of_shapes() -> tuple[Floats, Floats]:
 class Trend:
     """The test of all trends within dwells.
 
-    ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, 3): sum of these ratios
-    for each dwell and channel. numbers (D,): of the dwells. log_density: logarithm of the density of the coefficients
-    in this noise, but for a constant that is that of the dwells.
+    ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, c): sum of these ratios
+    for each dwell and channel; of the reading along the force alone where attitudes are not known. numbers (D,): of the
+    dwells. log_density: logarithm of the density of the coefficients in this noise, but for a constant that is that of
+    the dwells.
     """
 
     ratio: float
@@ -89,10 +91,17 @@ class Trend:
         return min(self.p_value / REST, 1.0)
 
     @property
-    def most(self) -> tuple[int, int]:
-        """The number of the dwell with the largest sum and the channel, counted from 1."""
+    def most(self) -> tuple[int, int | None]:
+        """The number of the dwell with the largest sum and the channel, counted from 1; None for that along the
+        force."""
         dwell, channel = np.unravel_index(int(self.sums.argmax()), self.sums.shape)
-        return int(self.numbers[dwell]), int(channel) + 1
+        return int(self.numbers[dwell]), int(channel) + 1 if self.sums.shape[1] > 1 else None
+
+    @property
+    def most_in_words(self) -> str:
+        """Where it is largest, in words."""
+        dwell, channel = self.most
+        return f"most in dwell {dwell}" + (f", accelerometer {channel}" if channel else "")
 
 
 def trend(fitted: Fit) -> Trend | None:
@@ -120,24 +129,26 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     if folded.averaged or not noise.scatter.stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
-    squares, determined = _squares(dwells, _residuals(linearised, state))
+    channels = _channels(linearised, noise, state)
+    squares, determined = _squares(dwells, _combined(channels, _residuals(linearised, state), dwells))
     by_readings = (sigma**2 / (folded.weights * folded.counts[:, None]))[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s[:, None] ** 2 * lengths_s[:, None, None] * walk_shapes
     by_noise = by_readings + by_walk + noise.scatter.flicker_mps2(len(dwells))[:, None] ** 2 * flicker_shapes
-    expected = by_noise + _by_thermometer(linearised, noise)
+    expected = channels**2 @ by_noise + _by_thermometer(linearised, noise, channels)
     ratios = np.where(determined[:, None, :], squares / expected, 0.0)
-    count = 3 * int(determined.sum())
+    count = channels.shape[1] * int(determined.sum())
     if not count:
         return None
     unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
+    by_walk = channels**2 @ np.broadcast_to(by_walk, by_noise.shape)
     unsure += (2.0 * noise.walk.spread * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)
     log_density = _log_density(
         squares[shown],
         (expected - by_walk)[shown],
-        np.broadcast_to(by_walk, squares.shape)[shown],
+        by_walk[shown],
         noise.walk.spread,
     )
     return Trend(ratio, f_tail(count, 2.0 / unsure, ratio), ratios.sum(axis=2), folded.numbers, log_density)
@@ -153,14 +164,29 @@ def _log_density(squares: Floats, by_noise: Floats, by_walk: Floats, spread: flo
     return float(np.logaddexp.reduce(logs))
 
 
-def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | float:
-    """Return the variances (D, 3, degrees) of the coefficients that the error of the temperature gives."""
-    thermometer = noise.term(ThermometerError)
+def _channels(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Floats:
+    """Return the combinations (D, c, 3) of the readings of each dwell that are tested: each reading; that along the
+    force alone where attitudes are not known, since a hand creeps and trembles, and no rotation changes it."""
+    if not noise.attitude_unknown:
+        return np.broadcast_to(np.eye(3), (len(linearised.dwells), 3, 3))
+    dwells = linearised.dwells_at_state
+    return along_force(dwells, sensitivities_of(dwells, state))[:, None]
+
+
+def _combined(channels: Floats, rows: Floats, dwells: DwellTable) -> Floats:
+    """Return the combinations (D, c, 3) of rows of readings (pieces, K, 3, ...), (pieces, K, c, ...)."""
+    return np.einsum("pci,pki...->pkc...", np.repeat(channels, dwells.folded.piece_numbers, axis=0), rows)
+
+
+def _by_thermometer(linearised: LinearisedDwells, noise: Noise, channels: Floats) -> Floats | float:
+    """Return the variances (D, c, degrees) of the coefficients that the error of the temperature gives."""
+    thermometer, dwells = noise.term(ThermometerError), linearised.dwells
     if thermometer is None:
         return 0.0
     of_errors = basis_coefficients(thermometer.columns(linearised.dwells_at_state, linearised.state))
-    squares, _ = _squares(linearised.dwells, _on_triangles(linearised.dwells, of_errors))
-    return squares.reshape(len(squares), 3, -1, _DEGREE).sum(axis=2)
+    of_errors = _combined(channels, of_errors, dwells)
+    squares, _ = _squares(dwells, _on_triangles(dwells, of_errors.reshape(*of_errors.shape[:2], -1)))
+    return squares.reshape(*channels.shape[:2], -1, _DEGREE).sum(axis=2)
 
 
 def _residuals(linearised: LinearisedDwells, state: Floats) -> Floats:

@@ -231,11 +231,10 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
     if diagnosis.test.consistent is False:
         parts.append(_dwell_table(diagnosis))
     if diagnosis.test.consistent is False and trend and trend.p_value < LEVEL:
-        dwell, channel = trend.most
         parts.append(
             Text(
                 f"The readings also drift within dwells: their slopes and curvatures have {trend.ratio:.2f} times the "
-                f"power of noise (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
+                f"power of noise (p {format_p(trend.p_value)}), {trend.most_in_words}."
             )
         )
     unknown, going = diagnosis.description, diagnosis.next_orientation
