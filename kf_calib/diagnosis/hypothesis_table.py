@@ -38,12 +38,11 @@ AS_WELL = " as well as "
 """Between the drivers of two unknown functions."""
 
 PRIOR = {
-    "nothing": 0.4, "effect": 0.35, "pair": 0.08, "unknown": 0.1, "unknowns": 0.01, "beside": 0.02, "dwell": 0.02,
-    "three": 0.02,
+    "nothing": 0.4, "effect": 0.365, "pair": 0.08, "three": 0.005, "unknown": 0.1, "unknowns": 0.01, "beside": 0.02,
+    "dwell": 0.02,
 }  # fmt: skip
 """Prior probability of each kind of explanation; ``unknowns``: two unknown functions; ``beside``: an effect beside one;
-``three``: so many effects and unknown functions, as many of each as likely; ``dwell``: one dwell alone is off; of
-several, each has that of one."""
+``three``: so many effects; ``dwell``: one dwell alone is off; of several, each has that of one."""
 
 _ALIKE = 0.05 * PRIOR["unknown"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.independent_bench import DWELL_S, IndependentBench, State
 from helpers.long_runs import slow
 from helpers.paths import RECORDINGS, SHARED
 from helpers.recordings import ACCEL, read, write_officially
@@ -282,3 +283,26 @@ def test_a_recording_needs_no_angles_and_standard_gravity_is_used_where_none_is_
     assert np.array_equal(read(source).accel.values, ACCEL[3].values)
     stated = kf_calib.open_recording(bare, {"gravity_mps2": "9.8123"}, angles=False)
     assert stated.bench.gravity_mps2 == 9.8123 and not stated.warnings
+
+
+@pytest.mark.parametrize(
+    "creep_rad, seeds", [(1e-3, range(1, 13)), *slow((1e-3, range(21, 81)), (2e-2, range(21, 81)))]
+)
+def test_a_hand_that_creeps_within_dwells_is_no_misfit(creep_rad: float, seeds: range) -> None:
+    """Turned about any axis in each dwell, by up to ten times what its readings show."""
+    p_values = list[float]()
+    for seed in seeds:
+        turns = creep_rad * np.random.default_rng(seed).standard_normal((24, 3))
+        run = IndependentBench(
+            seed, base=partial(_crept, turns=turns), bench=Bench((), G, scatter_sigma_mps2=0.0, angles=False),
+            white_mps2=2e-3,
+        )  # fmt: skip
+        p_value = kf_calib.calibrate(run).consistency.p_value
+        assert p_value is not None
+        p_values.append(p_value)
+    assert kstest(p_values, "uniform").pvalue > 1e-3 and min(p_values) > 0.01 / len(p_values) / 10
+
+
+def _crept(state: State, turns: np.ndarray) -> np.ndarray:
+    """The rotation vectors (n, 3) by which a hand has turned since its arrival."""
+    return (state.since_s / DWELL_S)[:, None] * turns[state.dwell]

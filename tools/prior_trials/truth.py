@@ -26,8 +26,8 @@ from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.noise.means import means_of
 
 NOTHING, NOISE, UNKNOWN, DWELL = "nothing", "noise", "unknown", "one dwell"
-_COUNTS = {"effect": (1, 0), "pair": (2, 0), "unknown": (0, 1), "beside": (1, 1), "unknowns": (0, 2)}
-"""Effects and unknown functions of each kind of explanation; three may be any of them."""
+_COUNTS = {"effect": (1, 0), "pair": (2, 0), "three": (3, 0), "unknown": (0, 1), "beside": (1, 1), "unknowns": (0, 2)}
+"""Effects and unknown functions of each kind of explanation."""
 
 _NOISE_RANGE = (0.1, 100.0)  # of noise from dwell to dwell, in that which was stated
 _LARGEST = 3000.0  # root of chi-squared of an explanation: a larger one is drawn again, since it is far from linear
@@ -74,9 +74,6 @@ class Prior:
         names, nothing = self._terms.names, np.zeros((len(self._dwells.folded.pieces), 3, 3))
         weights = [effect_named(name, self._terms.bench).prior for name in names]
         known, unknown = _COUNTS.get(kind, (0, 0))
-        if kind == "three":
-            known = int(rng.integers(4))
-            unknown = 3 - known
         sets = [*itertools.combinations(range(len(names)), known)]
         chosen = sorted(names[k] for k in _one_of(rng, sets, [math.prod(weights[k] for k in each) for each in sets]))
         parts = [self._of_row(rng, name) for name in chosen]
