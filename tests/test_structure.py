@@ -195,7 +195,7 @@ CEILINGS = {
     "noise": 3406,
     "estimation": 8007,
     "design": 1879,
-    "diagnosis": 6381,
+    "diagnosis": 6399,
     "online": 1631,
     "exchange": 1964,
     "views": 6907,

@@ -38,11 +38,16 @@ AS_WELL = " as well as "
 """Between the drivers of two unknown functions."""
 
 PRIOR = {
-    "nothing": 0.4, "effect": 0.365, "pair": 0.08, "three": 0.005, "unknown": 0.1, "unknowns": 0.01, "beside": 0.02,
-    "dwell": 0.02,
+    "nothing": 0.4, "effect": 0.36, "pair": 0.08, "three": 0.005, "unknown": 0.1, "unknowns": 0.01, "beside": 0.02,
+    "two beside": 0.005, "dwell": 0.02,
 }  # fmt: skip
-"""Prior probability of each kind of explanation; ``unknowns``: two unknown functions; ``beside``: an effect beside one;
-``three``: so many effects; ``dwell``: one dwell alone is off; of several, each has that of one."""
+"""Prior probability of each kind of explanation; ``dwell``: one dwell is off; of several, each has that of one."""
+
+KINDS = {
+    (1, 0): "effect", (2, 0): "pair", (3, 0): "three", (0, 1): "unknown", (0, 2): "unknowns", (1, 1): "beside",
+    (2, 1): "two beside",
+}  # fmt: skip
+"""What an explanation of so many effects, and so many unknown functions, is called in ``PRIOR``."""
 
 _ALIKE = 0.05 * PRIOR["unknown"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 

@@ -24,6 +24,7 @@ from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
     AS_WELL,
     IRREGULAR,
+    KINDS,
     LISTED,
     NOISE,
     NONE,
@@ -72,7 +73,6 @@ _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows furt
 _NODES = {1: 16, 2: 16, 3: 8}  # sizes of each of so many effects
 _ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
 _AT_ONCE = 8  # sizes of noise, of which the products of all columns are copied
-_OF_EFFECTS = {1: "effect", 2: "pair", 3: "three"}
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 _Fitted = tuple[Hypothesis, Spanned, Courses]
@@ -264,13 +264,8 @@ class RunPosterior:
         causes, unknown = max(self._run.causes, 3), len(self._run.unknown)
         prior = math.prod(self._effects[name].prior for name in effects)
         known = len(self._run.causes_of(effects))
-        if functions == 2:
-            kind, among = "unknowns", math.comb(unknown, 2)
-        elif functions:
-            kind, among = ("beside", causes * unknown) if effects else ("unknown", unknown)
-        else:
-            kind, among = _OF_EFFECTS[known], math.comb(causes, known)
-        return math.log(PRIOR[kind] * prior / among)
+        among = math.comb(causes, known) * math.comb(unknown, functions)
+        return math.log(PRIOR[KINDS[known, functions]] * prior / among)
 
     def _tested(self, name: str) -> tuple[float, int]:
         """Return the fall of chi-squared by an effect in the linear tests, and its degrees of freedom."""
@@ -348,7 +343,7 @@ class RunPosterior:
 
     def _several(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, and of the likeliest summands of unknown functions, each with any
-        other term beside it, and of the likeliest pairs of effects with one more."""
+        other term beside it, and of the likeliest pairs with one more effect, or unknown function."""
         terms, heads = self._run.terms, [(k,) for k in (*self._heads(), *self._summands_to_pair())]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for (k,) in heads]
         pairs, beside = _Rows(), list[tuple[_Head, Floats, Floats]]()
@@ -365,11 +360,11 @@ class RunPosterior:
         alone_of |= {name: max(log, alone_of[name]) for log, (name, *others) in pairs.values() if not others}
         for k in (k for k, unknown in enumerate(self._run.unknown) if not unknown.summands):
             alone_of.pop(f"?{k}", None)  # what changes irregularly has no formula
-        rows = {key: self._row_beside(names, log, alone_of) for key, (log, names) in pairs.items()}
+        rows = {key: self._row_beside(names, log, alone_of, pairs) for key, (log, names) in pairs.items()}
         triples, several = _Rows(), self._pairs_to_extend(rows, beside)
         for head, _, logs in self._beside([head for head, _ in several], [alone for _, alone in several]):
             self._add_beside(triples, head, self._by_row(logs))
-        return [*rows.values(), *(self._row_of(names, log) for log, names in triples.values())]
+        return [*rows.values(), *(self._row_beside(names, log, alone_of, pairs) for log, names in triples.values())]
 
     def _beside(self, heads: Sequence[_Head], alone: Sequence[Floats]) -> Iterator[tuple[_Head, Floats, Floats]]:
         """Yield heads, some terms together each, with the log likelihoods (terms, noises) and log evidence (terms,) of
@@ -389,43 +384,50 @@ class RunPosterior:
             yield head, logs, np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
 
     def _add_beside(self, rows: _Rows, head: _Head, of_rows: dict[str, float]) -> None:
-        """Add the log evidence of rows of the terms of a head with one other row each, which may have come already: of
-        one term any other, of two effects any other effect."""
+        """Add the log evidence of rows of the terms of a head with one other row each, which may have come already; of
+        three causes one at most is an unknown function, or a walk: two of them and an effect fit nearly everything."""
         terms = [self._run.terms[k] for k in head]
         for other, log in of_rows.items():
-            changes = other == self._run.arrivals and not terms[0].is_known
-            fits = len(head) == 1 or not other.startswith("?")
-            if fits and not changes and all(self._is_pair(term.row, other) for term in terms):
-                names = *(term.row for term in terms), other
+            names = *(term.row for term in terms), other
+            changes = other == self._run.arrivals and not all(term.is_known for term in terms)
+            too_free = len(names) > 2 and len(_unknown(names)) + (self._run.walk in names) > 1
+            if not changes and not too_free and all(self._is_pair(term.row, other) for term in terms):
                 before, names = rows.get(frozenset(names), (-math.inf, names))
                 rows[frozenset(names)] = max(before, log), names
 
-    def _row_beside(self, names: Sequence[str], log: float, alone: dict[str, float]) -> Hypothesis:
-        """Return a row where what an effect gains beside an unknown function counts in part, as far as this explains
-        more than the effect does without it: no function is just one that is tried, and what it leaves is no noise of
+    def _row_beside(self, names: Sequence[str], log: float, alone: dict[str, float], pairs: _Rows) -> Hypothesis:
+        """Return a row where what effects gain beside an unknown function counts in part, as far as this explains more
+        than the effects do without it: no function is just one that is tried, and what it leaves is no noise of
         independent dwells. What changes irregularly has no formula: it is noise, with which all of it counts."""
-        functions = max((alone.get(name, -math.inf) for name in names if name.startswith("?")), default=-math.inf)
-        effects = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
+        unknown = _unknown(names)
+        known = [name for name in names if name not in unknown]
+        functions = max((alone.get(name, -math.inf) for name in unknown), default=-math.inf)
+        effects = max((alone[name] for name in known), default=math.inf)
+        effects = max(effects, pairs.get(frozenset(known), (-math.inf,))[0])
         log -= (1.0 - INDEPENDENT) * max(min(functions - effects, log - functions), 0.0)
         return self._row_of(names, log)
 
     def _pairs_to_extend(self, rows: dict[frozenset[str], Hypothesis], beside: Sequence[tuple[_Head, Floats, Floats]]
                          ) -> list[tuple[_Head, Floats]]:  # fmt: skip
-        """Return the terms of the likeliest pairs of effects, in noise that is averaged over and in that stated, which
-        explain more than any effect alone, with their log likelihoods (noises,)."""
+        """Return the terms of the likeliest pairs, and of the likeliest of effects alone, in noise that is averaged
+        over and in that stated, which explain more than any such row of one term, with their log likelihoods (noises,).
+        What has no formula is tried beside pairs, and no pair is made of it."""
         terms, best = self._run.terms, dict[frozenset[str], tuple[float, float, _Head, Floats]]()
-        known = [k for k, term in enumerate(terms) if term.is_known and term.row != self._run.walk]
         for (head,), likelihoods, logs in beside:
-            for other, k in self._likeliest_of(logs, known).items():
+            for other, k in self._likeliest_of(logs, self._with_formula).items():
                 names = frozenset({terms[head].row, other})
-                if terms[head].is_known and names in rows and names not in best:
+                if len(names) == 2 and names in rows and names not in best and len(_unknown(names)) < 2:
                     alone = likelihoods[k] + self._log_share_of(k)
                     best[names] = rows[names].log_evidence, float(likelihoods[k, 0]), (head, k), alone
-        least = max((row.log_evidence for row in self._singles() if row.effects), default=math.inf)
-        of_stated = max((self._base[0] + self._log_bayes[k, 0] for k in known), default=math.inf)
-        likeliest = sorted((each for each in best.values() if each[0] > least), key=lambda each: -each[0])
-        largest = sorted((each for each in best.values() if each[1] > of_stated + _BEHIND), key=lambda each: -each[1])
-        return [*{head: alone for *_, head, alone in (*likeliest[:_HEADS], *largest[:_HEADS])}.items()]
+        chosen, singles, stated = dict[_Head, Floats](), self._singles(), self._base[0] + self._log_bayes[:, 0]
+        for known in ({True, False}, {True}):
+            least = max((row.log_evidence for row in singles if bool(row.effects) in known), default=math.inf)
+            of_stated = max((stated[k] for k, term in enumerate(terms) if term.is_known in known), default=math.inf)
+            among = [each for each in best.values() if {terms[k].is_known for k in each[2]} <= known]
+            likeliest = sorted((each for each in among if each[0] > least), key=lambda each: -each[0])[:_HEADS]
+            largest = sorted((each for each in among if each[1] > of_stated + _BEHIND), key=lambda each: -each[1])
+            chosen |= {head: alone for *_, head, alone in (*likeliest, *largest[:_HEADS])}
+        return [*chosen.items()]
 
     def _is_pair(self, one: str, other: str) -> bool:
         """Tell whether two rows together are another explanation: neither is of a gimbal that the other has, nor are
@@ -503,6 +505,12 @@ class RunPosterior:
         """Return the number of the likeliest of some terms of each row by log evidence (terms,)."""
         least_first = sorted(numbers, key=lambda k: (float(logs[k]), -k))
         return {self._run.terms[k].row: k for k in least_first}
+
+    @cached_property
+    def _with_formula(self) -> list[int]:
+        """The numbers of terms of one effect, or of one summand of an unknown function."""
+        terms = enumerate(self._run.terms)
+        return [k for k, term in terms if len(term.summands) == 1 or (term.is_known and term.row != self._run.walk)]
 
     def _log_share_of(self, k: int) -> float:
         """Return the log of the mean likelihood of an effect, in one accelerometer or in all as a term has it, over
@@ -721,6 +729,11 @@ def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[
     dwells = table.first.dwells[:1]
     sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE
     return [*rows, *beside] if sure and any(table.first.dwells == row.dwells for row in beside) else rows
+
+
+def _unknown(names: Iterable[str]) -> list[str]:
+    """Return those of the names of rows that are of unknown functions."""
+    return [name for name in names if name.startswith("?")]
 
 
 def _gains(gram: Floats, along: Floats) -> Floats:

@@ -184,7 +184,7 @@ def _by_thermometer(linearised: LinearisedDwells, noise: Noise, channels: Floats
     if thermometer is None:
         return 0.0
     of_errors = basis_coefficients(thermometer.columns(linearised.dwells_at_state, linearised.state))
-    of_errors = _combined(channels, of_errors, dwells)
+    of_errors = _combined(channels, of_errors.reshape(*of_errors.shape[:2], 3, -1), dwells)
     squares, _ = _squares(dwells, _on_triangles(dwells, of_errors.reshape(*of_errors.shape[:2], -1)))
     return squares.reshape(*channels.shape[:2], -1, _DEGREE).sum(axis=2)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.hypothesis_table import PRIOR
+from kf_calib.diagnosis.hypothesis_table import KINDS, PRIOR
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.run_likelihood import RunLikelihood
 from kf_calib.diagnosis.run_terms import _DECADES, EVERY, RunTerm, RunTerms
@@ -26,7 +26,7 @@ from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.noise.means import means_of
 
 NOTHING, NOISE, UNKNOWN, DWELL = "nothing", "noise", "unknown", "one dwell"
-_COUNTS = {"effect": (1, 0), "pair": (2, 0), "three": (3, 0), "unknown": (0, 1), "beside": (1, 1), "unknowns": (0, 2)}
+_COUNTS = {kind: counts for counts, kind in KINDS.items()}
 """Effects and unknown functions of each kind of explanation."""
 
 _NOISE_RANGE = (0.1, 100.0)  # of noise from dwell to dwell, in that which was stated
