@@ -36,7 +36,7 @@ class AxesAcross(NoiseTerm):
         """The root of the mean square (1,) of the angles that input axes may have, and have, from their nominal
         axes."""
         has, nominal = (_unit_axes(state) for state in (self.state, self.model.nominal_state()))
-        square = float(np.sum(np.cross(has, nominal) ** 2)) / (2 * len(has) - len(self.model.fixed))
+        square = float(np.sum(np.cross(has, nominal) ** 2)) / max(2 * len(has) - len(self.model.fixed), 1)
         return np.array([max(math.sqrt(square), 0.0 if self.model.bench.angles else self.model.bench.square_rad)])
 
     def columns(self, dwells: DwellTable, state: Floats) -> Floats:
