@@ -41,7 +41,7 @@ class AxesAcross(NoiseTerm):
 
     def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         del state
-        folded = dwells.folded
+        folded, to_sigma = dwells.folded, 0.5 * self.sizes / DIFFERENCE
         effects, stimulus = bent_effects(self.model, self.state), stimulus_of(dwells, self.model.bench, self.state)
         changes = np.zeros((len(stimulus), 3, 3, 3))  # pieces, channels, accelerometers that are turned, axes
         for axis in range(3):
@@ -53,7 +53,7 @@ class AxesAcross(NoiseTerm):
                     previous_force_mps2=stimulus.previous_force_mps2 @ turn.T,
                 )  # fmt: skip
                 ends.append(added_by(effects, turned, self.model, self.state))
-            changes[:, [0, 1, 2], [0, 1, 2], axis] = (ends[0] - ends[1]) * (0.5 * self.sizes / DIFFERENCE)
+            changes[:, [0, 1, 2], [0, 1, 2], axis] = (ends[0] - ends[1]) * to_sigma
         of_dwells = folded.weighted(changes.reshape(-1, 3, 3, 9).mean(axis=1))
         of_dwells = of_dwells[..., np.abs(of_dwells).max(axis=(0, 1)) > FLOOR_MPS2]
         return folded.at_nodes(np.repeat(of_dwells, 3 * folded.piece_numbers, axis=0)).values

@@ -13,6 +13,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import kf_calib
+from kf_calib.bench.bench import Bench
+from kf_calib.estimation.axes_across import AxesAcross
+from kf_calib.estimation.measurement_model import SQUARE, Model
 
 KINDS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
     "cross-axis-square": lambda i, p, o: p * p,
@@ -86,3 +89,9 @@ def test_misfit_and_sigmas_are_those_of_axes_that_are_not_known(kind: str) -> No
     assert kstest(p_values, "uniform").pvalue > 1e-3
     # sigmas are too wide where the axes turn with the input axis, which is known
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.25
+
+
+def test_where_all_axes_are_taken_for_square_they_may_be_off_by_what_is_stated() -> None:
+    """Six faces in the hand: no input axis tells by how much."""
+    model = Model(Bench((), G, angles=False), square=tuple(SQUARE))
+    assert AxesAcross(model, model.nominal_state()).sizes == pytest.approx([model.bench.square_rad])
