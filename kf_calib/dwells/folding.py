@@ -159,9 +159,13 @@ class Folder:
             turns=rows.turns,
         )  # fmt: skip
         innovation, readings = rows.without_rotations
-        if not rows.moving and growing.autocovariance_count(rows.dwell) <= 2 * BLOCK_SAMPLES:  # of the first blocks
+        known = 0 if rows.moving else growing.autocovariance_count(rows.dwell)
+        if not rows.moving and known <= 2 * BLOCK_SAMPLES:  # of the first blocks
             residuals = detrended(innovation, rows.elapsed_s, self.carrier_hz)
-            autocovariance, spectrum = Autocovariance.of(residuals), Spectrum.of(residuals, rows.elapsed_s)
+            autocovariance, spectrum = (
+                Autocovariance.of(residuals, first=not known),
+                Spectrum.of(residuals, rows.elapsed_s),
+            )
             block = replace(block, autocovariance=autocovariance, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
         if self._cells and not rows.moving and not block.pieces.averaged and self._traced < MOST_CELLS:
@@ -181,7 +185,8 @@ def dwells_of_table(table: Orientations, bench: Bench) -> DwellTable:
     pieces = Pieces(_triangles(table, times), _nodes(table, bench), times * table.counts, table.counts)
     folded = FoldedDwells(
         pieces, np.arange(count + 1), np.arange(1, count + 1), np.zeros(count, bool), np.zeros(count),
-        np.ones((count, 3)), [()] * count, [Autocovariance()] * count, [Spectrum()] * count, [Trace()] * count,
+        np.ones((count, 3)), np.tile(np.eye(3), (count, 1, 1)), [()] * count, [Autocovariance()] * count,
+        [Spectrum()] * count, [Trace()] * count,
     )  # fmt: skip
     return DwellTable(folded)
 

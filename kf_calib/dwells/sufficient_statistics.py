@@ -27,6 +27,8 @@ from kf_calib.dwells.pieces import Pieces
 
 LAGS = 64
 """Lags of the autocovariance; fewer readings tell no correlation of their own."""
+CROSS_LAGS = 8
+"""Lags of the products of one channel with another, of a dwell's first block."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +38,17 @@ class Autocovariance:
 
     The parabola is removed because a drift would otherwise count as noise, and the test for the drift would lose its
     power.
+
+    across (CROSS_LAGS + 1, 3, 3): the sums of x_t x_(t-k)^T over all channels, of the ``crossed`` readings of which
+    they were formed.
     """
 
     products: Floats = field(default_factory=lambda: np.zeros((LAGS + 1, 3)))
     pairs: Floats = field(default_factory=lambda: np.zeros(LAGS + 1))
     count: int = 0
     blocks: int = 0
+    across: Floats = field(default_factory=lambda: np.zeros((CROSS_LAGS + 1, 3, 3)))
+    crossed: int = 0
 
     def __add__(self, other: Autocovariance) -> Autocovariance:
         return Autocovariance(
@@ -49,22 +56,32 @@ class Autocovariance:
             self.pairs + other.pairs,
             self.count + other.count,
             self.blocks + other.blocks,
+            self.across + other.across,
+            self.crossed + other.crossed,
         )
 
     def times(self, weights: Floats) -> Autocovariance:
         """The sums with the products of each channel times its weight (3,)."""
-        return self if (weights == 1.0).all() else replace(self, products=weights * self.products)
+        if (weights == 1.0).all():
+            return self
+        across = np.sqrt(np.outer(weights, weights)) * self.across
+        return replace(self, products=weights * self.products, across=across)
 
     @classmethod
-    def of(cls, residuals: Floats) -> Autocovariance:
-        """The sums for one block of readings (3, n) from which the parabola has been removed."""
+    def of(cls, residuals: Floats, first: bool = True) -> Autocovariance:
+        """The sums for one block of readings (3, n) from which the parabola has been removed; those over all channels
+        if it is the first of its dwell."""
         count = residuals.shape[1]
         padded = 1 << (count + LAGS).bit_length()
         spectrum = np.fft.rfft(residuals, padded, axis=1)
         products = np.zeros((LAGS + 1, 3))
         lags = min(LAGS, count - 1) + 1
         products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
-        return cls(products, np.maximum(count - np.arange(LAGS + 1), 0).astype(float), count, 1)
+        pairs = np.maximum(count - np.arange(LAGS + 1), 0).astype(float)
+        if not first or count <= CROSS_LAGS:
+            return cls(products, pairs, count, 1)
+        across = [residuals[:, lag:] @ residuals[:, : count - lag].T for lag in range(CROSS_LAGS + 1)]
+        return cls(products, pairs, count, 1, np.array(across), count)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -79,6 +96,7 @@ class Dwell:
     - pose_sigma_rad: uncertainty of its pose due to noise of the angles.
     - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
     - weights (3,): of the readings of each channel, the variance of one of the run over that of one of this dwell.
+    - correlation (3, 3): of the means of the readings of two channels, by noise that they share.
     """
 
     number: int
@@ -90,6 +108,7 @@ class Dwell:
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
     weights: tuple[float, ...] = (1.0, 1.0, 1.0)
+    correlation: Floats = field(default_factory=lambda: np.eye(3))
 
     @property
     def carrier_hz(self) -> float:

@@ -48,6 +48,7 @@ class FoldedDwells:
     moving: Mask
     pose_sigmas_rad: Floats
     weights: Floats
+    correlations: Floats
     turns: Sequence[tuple[int, ...]]
     autocovariances: Sequence[Autocovariance]
     spectra: Sequence[Spectrum]
@@ -63,6 +64,7 @@ class FoldedDwells:
             np.array([dwell.moving for dwell in dwells], bool),
             np.array([dwell.pose_sigma_rad for dwell in dwells]),
             np.array([dwell.weights for dwell in dwells]).reshape(-1, 3),
+            np.array([dwell.correlation for dwell in dwells]).reshape(-1, 3, 3),
             [dwell.turns for dwell in dwells],
             [dwell.autocovariance for dwell in dwells],
             [dwell.spectrum for dwell in dwells],
@@ -92,7 +94,8 @@ class FoldedDwells:
     def equals(self, other: FoldedDwells) -> bool:
         """Whether these are the same dwells."""
         pairs = ((self.pieces.triangles, other.pieces.triangles), (self.elapsed_s, other.elapsed_s),
-                 (self.ends, other.ends), (self.weights, other.weights))  # fmt: skip
+                 (self.ends, other.ends), (self.weights, other.weights),
+                 (self.correlations, other.correlations))  # fmt: skip
         return all(np.array_equal(one, another) for one, another in pairs)
 
     @property
@@ -104,6 +107,11 @@ class FoldedDwells:
     def carrier_hz(self) -> float:
         """Frequency of the carrier on which the dwells were folded; 0 for none."""
         return self.pieces.carrier_hz
+
+    @cached_property
+    def correlated(self) -> bool:
+        """Whether channels share noise in any of the dwells."""
+        return bool((self.correlations != np.eye(3)).any())
 
     @property
     def averaged(self) -> bool:
@@ -334,7 +342,7 @@ class DwellTable(ComputedSequence[Dwell]):
         return Dwell(
             int(folded.numbers[k]), self.pieces[folded.ends[k] : folded.ends[k + 1]], folded.autocovariances[k],
             folded.spectra[k], folded.traces[k], bool(folded.moving[k]), float(folded.pose_sigmas_rad[k]),
-            folded.turns[k], tuple(folded.weights[k].tolist()),
+            folded.turns[k], tuple(folded.weights[k].tolist()), folded.correlations[k],
         )  # fmt: skip
 
     def take(self, dwells: Sequence[int] | Indices, at_most: int | None = None) -> DwellTable:
@@ -388,9 +396,11 @@ class DwellTable(ComputedSequence[Dwell]):
             size = 2 * size if size > 7 else size + 1
         yield self.take([k])
 
-    def weighted(self, weights: Floats) -> DwellTable:
-        """The same dwells with other weights (D, 3) of their readings."""
-        return replace(self, folded=replace(self.folded, weights=weights))
+    def weighted(self, weights: Floats, correlations: Floats | None = None) -> DwellTable:
+        """The same dwells with other weights (D, 3) of their readings, and other correlations (D, 3, 3) of their means
+        if given."""
+        kept = self.folded.correlations if correlations is None else correlations
+        return replace(self, folded=replace(self.folded, weights=weights, correlations=kept))
 
     def linearised(self, turned_rad: Floats | None, attitudes: Attitudes | None) -> DwellTable:
         """The same dwells about forces that are turned otherwise."""

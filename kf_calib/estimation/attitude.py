@@ -116,8 +116,8 @@ def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Fl
     axes = tangents(means.force_mps2)
     sensitivities = state[:STATE_COUNT].reshape(3, 4)[:, :3] + bendings
     columns = rotation_map(means.force_mps2, sensitivities, axes)
-    weights = 1.0 / (noise.effective_sigma_mps2**2 / means.counts + noise.scatter_mps2**2)
-    weighted = np.swapaxes(columns * weights[:, :, None], 1, 2)
+    spreads = noise.of_means(means.counts, means.correlations) + np.diag(noise.scatter_mps2**2)
+    weighted = np.swapaxes(np.linalg.solve(spreads, columns), 1, 2)
     prior = 0.0 if noise.attitude_unknown else 1.0 / noise.setting_rad**2
     covariances = np.linalg.inv(lift_rounding(weighted @ columns + prior * np.eye(2)))
     errors = means.readings - means.design @ state

@@ -235,10 +235,10 @@ def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floa
 def _whitened(pieces: list[Samples]) -> Floats:
     """Return the whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
     rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])
-    sigma = np.concatenate([np.repeat(p.sigma_mps2[None], len(p.readings), axis=0) for p in pieces])[:, :, None]
-    flat = (rows / sigma).reshape(-1, rows.shape[2])
+    whiten = np.concatenate([np.repeat(np.linalg.inv(p.root_mps2)[None], len(p.readings), axis=0) for p in pieces])
+    flat = (whiten @ rows).reshape(-1, rows.shape[2])
     if pieces[0].nuisances.shape[2]:
-        shared = (np.concatenate([p.nuisances for p in pieces]) / sigma).reshape(len(flat), -1)
+        shared = (whiten @ np.concatenate([p.nuisances for p in pieces])).reshape(len(flat), -1)
         left, singular, _ = np.linalg.svd(shared, full_matrices=False)
         flat = flat - left @ ((1 - 1 / np.sqrt(1 + singular**2))[:, None] * (left.T @ flat))
     return flat

@@ -60,7 +60,8 @@ def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float 
     means = linearised.means
     across = weights_of_size(means, linearised.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
-    variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2 / means.counts).sum(1)
+    spreads = noise.of_means(means.counts, means.correlations) + np.diag(noise.scatter_mps2**2)
+    variance = np.einsum("di,dij,dj->d", across, spreads, across)
     nine = np.ix_(_NINE, _NINE)
     known = np.diag(weak_covariance(square_rad).diagonal()[_NINE] ** -0.5)
     rows = np.vstack([design[:, _NINE] / np.sqrt(variance)[:, None], known])  # their squares would lose what is weak
@@ -166,7 +167,7 @@ def holding_frame(samples: Iterable[Samples], linearised: LinearisedDwells, nois
         observation[np.arange(len(fixed)), 0, list(fixed)] = linearised.model.bench.gravity_mps2
         number, start_s = linearised.dwells[0].number, np.full(len(fixed), linearised.dwells[0].start_s)
         none, readings = np.zeros((len(fixed), 1, first.nuisances.shape[2])), np.zeros((len(fixed), 1))
-        sigma_mps2 = noise.effective_sigma_mps2[:1]
-        yield Samples(number, start_s, observation, none, readings, np.zeros((len(fixed), 3)), sigma_mps2)
+        root_mps2 = noise.effective_sigma_mps2[:1, None]
+        yield Samples(number, start_s, observation, none, readings, np.zeros((len(fixed), 3)), root_mps2)
         yield first
     yield from samples

@@ -38,7 +38,7 @@ class Samples:
     - nuisances (n, c, q): the columns of the dwell's nuisance states, each of unit variance before the dwell.
     - readings (n, c): the readings.
     - residual_mps2 (n, 3): the readings of the accelerometers less their prediction by the state of the linearisation.
-    - sigma_mps2 (c,): sigma of white readings with the same variance of their mean.
+    - root_mps2 (c, c): lower root of the covariance of white readings with the same covariance of their mean.
     """
 
     dwell: int
@@ -47,7 +47,7 @@ class Samples:
     nuisances: Floats
     readings: Floats
     residual_mps2: Floats
-    sigma_mps2: Floats
+    root_mps2: Floats
     moving: bool = False
 
     def along(self, weights: Floats) -> Samples:
@@ -57,7 +57,7 @@ class Samples:
             observation=np.einsum("i,nip->np", weights, self.observation)[:, None],
             nuisances=np.einsum("i,niq->nq", weights, self.nuisances)[:, None],
             readings=(self.readings @ weights)[:, None],
-            sigma_mps2=np.array([np.linalg.norm(weights * self.sigma_mps2)]),
+            root_mps2=np.array([[np.linalg.norm(weights @ self.root_mps2)]]),
         )
 
 
@@ -85,10 +85,11 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
             if dwell.attitudes is not None or dwell.turned_rad is not None:
                 force = dwell.felt(regressors[:, 1:], len(u))
                 readings = readings + turning_mps2(dwell, force, linearised.state, len(u))
-            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / np.sqrt(dwell.folded.weights[0])
+            folded = dwell.folded
+            root_mps2 = np.linalg.cholesky(noise.of(block.moving).of_means(folded.weights, folded.correlations)[0])
             residual_mps2 = readings - observation @ linearised.state
             samples = Samples(
-                block.dwell, block.elapsed_s[part], observation, nuisances, readings, residual_mps2, sigma_mps2,
+                block.dwell, block.elapsed_s[part], observation, nuisances, readings, residual_mps2, root_mps2,
                 block.moving,
             )  # fmt: skip
             yield samples.along(along) if along is not None else samples
@@ -151,7 +152,7 @@ def estimate(
                 on_dwell(kf.state() / scale)
             kf.enter_dwell()
             place = (piece.dwell, piece.moving)
-        kf.set_noise(piece.sigma_mps2)
+        kf.set_noise(piece.root_mps2)
         observations = np.concatenate([piece.observation / scale, piece.nuisances], axis=2)
         for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
             if noise.walk.steps and now_s > previous_s:
@@ -209,12 +210,12 @@ class _Filter:
             kf._P1_2 = full  # its setter would square the root and lose half the digits
         self.kf = kf
 
-    def set_noise(self, sigma_mps2: Floats) -> None:
-        """Set the sigma of a reading."""
+    def set_noise(self, root_mps2: Floats) -> None:
+        """Set the covariance of a reading by its lower root (c, c)."""
         if self.plain:
-            self.kf.R = np.diag(sigma_mps2**2)
+            self.kf.R = root_mps2 @ root_mps2.T
         else:
-            self.kf._R1_2 = np.diag(sigma_mps2)  # its setter would square the root and lose half the digits
+            self.kf._R1_2 = root_mps2  # its setter would square the root and lose half the digits
 
     def enter_dwell(self) -> None:
         """Reset the nuisance states to their prior, independent of everything before."""

@@ -147,6 +147,12 @@ def remarks_on(
             f"the noise within dwells differs, {most**-0.5:.2g} to {least**-0.5:.2g} times that of "
             "the run: each dwell has the weight of its own."
         )
+    if dwells.folded.correlated:
+        largest = float(np.abs(dwells.folded.correlations - np.eye(3)).max())
+        yield (
+            f"the accelerometers share noise within dwells, with a correlation of their means of up to {largest:.2g}, "
+            "as of a base that shakes: each dwell is weighted by what they share."
+        )
     if noise.setting.considered and noise.scatter_mps2.any() and not noise.scatter.stated:
         known, freedom = directions(linearised.means.force_mps2), degrees_of_freedom(linearised.means)
         yield (

@@ -417,9 +417,11 @@ def consistency(fitted: Fit) -> Consistency:
 def _freedom_of_noise(fitted: Fit) -> float:
     """Return the degrees of freedom of the noise beside which the misfit is judged: n readings tell the variance of
     their mean to a relative variance of (4 kappa - 2) / n, as those of n / (2 kappa - 1) white ones do. Channels in
-    which dwells have unequal noise know it of each dwell from its own readings alone. The reciprocals are averaged."""
+    which dwells have unequal noise, or share it unequally, know it of each dwell from its own readings alone. The
+    reciprocals are averaged."""
     folded, lost = fitted.dwells.folded, 2.0 * fitted.noise.correlation_length - 1.0
     counts, own = np.maximum(folded.counts - 4, 1), (folded.weights != 1.0).any(axis=0)
+    own = own | (folded.correlations != folded.correlations[:1]).any(axis=(0, 1))
     return float(1.0 / np.mean(lost * np.where(own, np.mean(1.0 / counts), 1.0 / counts.sum())))
 
 

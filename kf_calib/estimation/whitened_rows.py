@@ -181,6 +181,8 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
+    elif batch.table.folded.correlated:
+        parts, walks = _independent(parts, walks, batch.table.folded.correlations[batch.dwells])
     if noise.walk.steps:
         paths = batch.table.folded.walks
         for dwell_parts, k, ratios in zip(parts, batch.dwells.tolist(), walks, strict=True):
@@ -203,6 +205,9 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
     sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.table.folded.weights[batch.dwells])
     along = (roots / np.linalg.norm(roots, axis=1, keepdims=True))[:, None, None, :]
     rows = (along @ _channels(batch, columns, about, 1))[:, :, 0] / sigmas[:, :, None]
+    if batch.table.folded.correlated:
+        root = cast("Floats", np.linalg.cholesky(batch.table.folded.correlations[batch.dwells]))
+        rows = inverse_of_lower(root) @ rows
     changes = rows[..., :count]
     if np.abs(changes).max(initial=0.0) > _LARGE:  # squares would lose digits: eliminate by QR
         prior = np.broadcast_to(np.eye(count, rows.shape[2]), (len(rows), count, rows.shape[2]))
@@ -238,6 +243,18 @@ def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
     sensitivities = sensitivities_of(batch.table, state, batch.dwells)
     along = along_force(batch.table, sensitivities, batch.dwells) * noise.effective_sigma_mps2
     return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def _independent(parts: Floats, walks: Floats, correlations: Floats) -> tuple[Floats, Floats]:
+    """Return three combinations (d, 3, r, n) of whitened channels whose noise has these correlations (d, 3, 3), such
+    that neither noise nor walks of these intensities (d, 3) are common to two, and the intensities (d, 3) of these.
+
+    With the Cholesky factor L of the correlation and the eigenvectors V of L^-1 diag(q^2) L^-T they are V^T L^-1.
+    """
+    inverse = inverse_of_lower(cast("Floats", np.linalg.cholesky(correlations)))
+    squares, turns = np.linalg.eigh(inverse * walks[:, None] ** 2 @ np.swapaxes(inverse, 1, 2))
+    mixing = np.swapaxes(turns, 1, 2) @ inverse if walks.any() else inverse
+    return np.einsum("dij,djrn->dirn", mixing, parts), np.sqrt(np.maximum(squares, 0.0))
 
 
 def _combined(parts: Floats, along: Floats) -> Floats:

@@ -128,20 +128,21 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     dwells, folded = linearised.dwells, linearised.dwells.folded
     if folded.averaged or not noise.scatter.stated:
         return None
-    sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
+    lengths_s = folded.ends_s[:, 1] - folded.ends_s[:, 0]
     channels = _channels(linearised, noise, state)
     squares, determined = _squares(dwells, _combined(channels, _residuals(linearised, state), dwells))
-    by_readings = (sigma**2 / (folded.weights * folded.counts[:, None]))[:, :, None]
+    spreads = noise.of_means(folded.weights * folded.counts[:, None], folded.correlations)
+    by_readings = np.einsum("dci,dij,dcj->dc", channels, spreads, channels)[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s[:, None] ** 2 * lengths_s[:, None, None] * walk_shapes
-    by_noise = by_readings + by_walk + noise.scatter.flicker_mps2(len(dwells))[:, None] ** 2 * flicker_shapes
-    expected = channels**2 @ by_noise + _by_thermometer(linearised, noise, channels)
+    by_paths = by_walk + noise.scatter.flicker_mps2(len(dwells))[:, None] ** 2 * flicker_shapes
+    expected = by_readings + channels**2 @ by_paths + _by_thermometer(linearised, noise, channels)
     ratios = np.where(determined[:, None, :], squares / expected, 0.0)
     count = channels.shape[1] * int(determined.sum())
     if not count:
         return None
     unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
-    by_walk = channels**2 @ np.broadcast_to(by_walk, by_noise.shape)
+    by_walk = channels**2 @ np.broadcast_to(by_walk, by_paths.shape)
     unsure += (2.0 * noise.walk.spread * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)
@@ -165,12 +166,21 @@ def _log_density(squares: Floats, by_noise: Floats, by_walk: Floats, spread: flo
 
 
 def _channels(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Floats:
-    """Return the combinations (D, c, 3) of the readings of each dwell that are tested: each reading; that along the
-    force alone where attitudes are not known, since a hand creeps and trembles, and no rotation changes it."""
+    """Return the combinations (D, c, 3) of the readings of each dwell that are tested: each reading, less what it
+    shares with the others; that along the force alone where attitudes are not known, since a hand creeps and trembles,
+    and no rotation changes it."""
     if not noise.attitude_unknown:
-        return np.broadcast_to(np.eye(3), (len(linearised.dwells), 3, 3))
+        sigmas = noise.effective_sigma_mps2 / np.sqrt(linearised.dwells.folded.weights)
+        return sigmas[:, :, None] * _unshared(linearised.dwells.folded.correlations) / sigmas[:, None, :]
     dwells = linearised.dwells_at_state
     return along_force(dwells, sensitivities_of(dwells, state))[:, None]
+
+
+def _unshared(correlations: Floats) -> Floats:
+    """Return the symmetric inverse roots (D, 3, 3) of correlations: of all combinations that are not correlated, those
+    nearest to the channels themselves."""
+    values, vectors = np.linalg.eigh(correlations)
+    return (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
 
 
 def _combined(channels: Floats, rows: Floats, dwells: DwellTable) -> Floats:

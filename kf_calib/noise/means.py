@@ -23,6 +23,7 @@ class Means:
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
     - counts (D, 3): number of readings of each channel, each as many as its weight says.
     - ends_s (D, 2): when each dwell begins and ends.
+    - correlations (D, 3, 3): of the channels' means, by noise that they share.
     - bending (D, 3, 3): by how much effects change the readings per unit of force (``Attitudes``).
     """
 
@@ -31,13 +32,13 @@ class Means:
     force_mps2: Floats
     counts: Floats
     ends_s: Floats
+    correlations: Floats = field(default_factory=lambda: np.eye(3)[None])
     bending: Floats = field(default_factory=lambda: np.zeros((1, 3, 3)))
 
     def __getitem__(self, part: int | list[int] | slice) -> Means:
         known = {each.name: getattr(self, each.name) for each in fields(self)}
-        if len(self.bending) != len(self.counts):
-            del known["bending"]
-        return Means(**{name: values[part] for name, values in known.items()})
+        of_dwells = {name: values for name, values in known.items() if len(values) == len(self.counts)}
+        return Means(**{name: values[part] for name, values in of_dwells.items()})
 
     def sensitivities(self, state: Floats) -> Floats:
         """Change (D, 3, 3) of the mean readings per unit of force at ``state`` (p,), effects included."""
@@ -53,7 +54,7 @@ def means_of(dwells: Sequence[Dwell], columns: Sequence[Floats]) -> Means:
         design = _design(table, values)
     return Means(
         design, table.means[:, 4:], table.felt_means_mps2, table.folded.weights * table.folded.counts[:, None],
-        table.folded.ends_s, table.bendings,
+        table.folded.ends_s, table.folded.correlations, table.bendings,
     )  # fmt: skip
 
 

@@ -64,6 +64,12 @@ class Noise:
         """The readings (3,) that count as one where variances are estimated: kappa, but at least one."""
         return np.maximum(self.inflation, 1.0)
 
+    def of_means(self, counts: Floats, correlations: Floats) -> Floats:
+        """Covariances (D, 3, 3) of the means of so many readings (D, 3) by the noise within dwells, with these
+        correlations (D, 3, 3)."""
+        sigmas = self.effective_sigma_mps2 / np.sqrt(counts)
+        return sigmas[:, :, None] * correlations * sigmas[:, None, :]
+
     # What is in the list
 
     def term(self, kind: type[_T]) -> _T | None:
@@ -174,13 +180,13 @@ def steps(dwells: Sequence[Dwell], noise: Noise) -> Floats:
 
 
 def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: float = 0.0) -> Floats:
-    """Covariances (D, 3, 3) of the dwells' mean readings about the model: diag(kappa sigma_w^2 / n) and those of all
-    terms that are drawn for each dwell.
+    """Covariances (D, 3, 3) of the dwells' mean readings about the model: those by the noise within dwells,
+    kappa sigma_w^2 / n and what accelerometers share of it, and those of all terms that are drawn for each dwell.
 
     An attitude that is not known counts as a setting error so large that it leaves the size of f alone, also where the
     noise is not known yet and is to be estimated from a misfit of this rms size.
     """
-    covariances = (noise.effective_sigma_mps2**2 / means.counts)[:, :, None] * np.eye(3)
+    covariances = noise.of_means(means.counts, means.correlations)
     for term in noise.without(SettingError).terms:
         covariances = covariances + term.covariances(means, state)
     largest_mps2 = max(float(np.sqrt(np.einsum("dii->di", covariances).max())), misfit_mps2)
@@ -210,6 +216,5 @@ def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:
     count = means.design.shape[2]
     if not (noise.setting.considered and noise.setting_rad):
         return np.broadcast_to(np.zeros((count, count)), (len(means.counts), count, count))
-    weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
-    weighted = weight[:, :, None] * means.design
+    weighted = np.linalg.solve(mean_covariances(noise.weights, means, state), means.design)
     return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ setting_covariances(means, state) @ weighted

@@ -29,6 +29,7 @@ from kf_calib.bench.arrays import LAST_DIGITS, Floats
 from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
+from kf_calib.noise.cross_spectrum import correlations
 from kf_calib.support.searches import MOST_STEPS
 from kf_calib.support.tail_probabilities import CLEAR, chi_squared_tail
 
@@ -149,7 +150,8 @@ _QUIETEST = 0.1  # variance of a dwell, in the median of all
 
 
 def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTable:
-    """The dwells, each with the weights that its own noise gives the readings of its channels, 1 where all have one.
+    """The dwells, each with the weights that its own noise gives the readings of its channels, 1 where all have one,
+    and the correlations of its means by noise that channels share.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
@@ -165,9 +167,15 @@ def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTabl
         )
     if along is None:
         weights = np.minimum(weights, _weights_by_course(folded))
-    if np.array_equal(weights, folded.weights):
+    own = folded.correlations if along is not None else _correlations(folded)
+    if np.array_equal(weights, folded.weights) and np.array_equal(own, folded.correlations):
         return dwells
-    return dwells.weighted(weights)
+    return dwells.weighted(weights, own)
+
+
+@computed_once
+def _correlations(folded: FoldedDwells) -> Floats:
+    return correlations(folded.autocovariances, pooled_autocovariance(folded, shares_in_correlation(folded)))
 
 
 def pooled_autocovariance(folded: FoldedDwells, shares: Floats) -> Autocovariance:

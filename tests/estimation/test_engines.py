@@ -31,6 +31,7 @@ CASES = {
     "setting error": Run(seed=4, dwells=14, count=120, setting_deg=0.02),
     "coloured": Run(seed=5, dwells=8, count=200, phi=0.9),
     "scatter": Run(seed=6, dwells=8, count=150, scatter_mps2=1e-3),
+    "shared noise": Run(seed=7, dwells=8, count=150, shared_mps2=1e-4, shaken_mps2=2e-4),
 }
 
 
@@ -57,7 +58,9 @@ def test_three_ways_agree_on_what_orientations_about_one_axis_determine() -> Non
         assert way.max_difference_sigma < 1e-6 and way.max_relative_variance < 1e-9
 
 
-@pytest.mark.parametrize(("name", "walk"), [("paper grade", 0.0), ("scatter", 0.0), ("setting error", 1e-5)])
+@pytest.mark.parametrize(
+    ("name", "walk"), [("paper grade", 0.0), ("scatter", 0.0), ("setting error", 1e-5), ("shared noise", 1e-5)]
+)
 def test_plain_form_of_filterpy_agrees_to_its_own_rounding(name: str, walk: float) -> None:
     """With a stated prior; with a diffuse one (1e5 sigma) the plain form itself is off by 1e-4 sigma."""
     run = CASES[name]
@@ -83,7 +86,7 @@ def test_squares_of_filterpys_innovations_sum_to_the_misfit_of_batch_least_squar
     nominal, root = rng.normal(size=4), np.tril(rng.normal(size=(4, 4)))
     noise = Noise(np.full(3, sigma), np.ones(3))
     nuisances = np.zeros((20, 3, 0))
-    samples = Samples(1, np.arange(20.0), observation, nuisances, readings, readings, np.full(3, sigma))
+    samples = Samples(1, np.arange(20.0), observation, nuisances, readings, readings, sigma * np.eye(3))
     posterior = kalman_filterpy.estimate([samples], noise, nominal, root @ root.T, np.ones(4))
     rows = np.vstack([observation.reshape(-1, 4) / sigma, np.linalg.inv(root)])
     state, misfit, *_ = np.linalg.lstsq(rows, np.append(readings / sigma, np.linalg.solve(root, nominal)))

@@ -44,6 +44,8 @@ class Run:
     rate_hz: float = 20.0
     white_mps2: float = 1e-4
     phi: float = 0.0
+    shared_mps2: float = 0.0  # noise that all accelerometers have in common
+    shaken_mps2: float = 0.0  # a base that shakes up and down
     scatter_mps2: float = 0.0
     setting_deg: float = 0.0
     encoder_deg: float = 0.0
@@ -75,7 +77,7 @@ class Run:
             level = rows @ force + biases + rng.normal(size=3) * self.scatter_mps2
             stamps = start + np.arange(self.count) * step_ns
             times.append(stamps)
-            readings.append(level + self._noise(rng))
+            readings.append(level + self._noise(rng) + self._shared(rng, level - biases))
             pose_times.append(stamps[::10])
             told = np.repeat(pose[None], len(stamps[::10]), axis=0)
             encoders = np.random.default_rng([self.seed, len(pose_values)])
@@ -89,6 +91,10 @@ class Run:
             return rng.normal(size=(self.count, 3)) * self.white_mps2
         white = rng.normal(size=(self.count + 200, 3)) * np.sqrt(1 - self.phi**2)
         return lfilter([1.0], [1.0, -self.phi], white, axis=0)[200:] * self.white_mps2
+
+    def _shared(self, rng: np.random.Generator, felt: np.ndarray) -> np.ndarray:
+        shared = self.shared_mps2 and self.shared_mps2 * rng.normal(size=(self.count, 1))
+        return shared + (self.shaken_mps2 and self.shaken_mps2 * rng.normal(size=(self.count, 1)) * felt / G)
 
     def __iter__(self) -> Iterator[Batch]:
         for first in range(0, len(self.accel), self.batch):
