@@ -195,7 +195,7 @@ CEILINGS = {
     "noise": 3554,
     "estimation": 8044,
     "design": 1879,
-    "diagnosis": 6399,
+    "diagnosis": 6402,
     "online": 1631,
     "exchange": 1964,
     "views": 6907,

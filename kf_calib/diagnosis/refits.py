@@ -15,6 +15,7 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates
 from kf_calib.effects import oscillation_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit, refuse_unseen
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
@@ -162,13 +163,15 @@ def with_noise_beside_oscillation(refits: Refits, before: Calibration) -> Calibr
     if oscillation is None or before.model.oscillates or not (before.consistency.quiet and before.noise.within_seen):
         return None
     try:
-        beside = refits.with_effects(before, (str(oscillation),)).noise
+        beside = refits.with_effects(before, (str(oscillation),)).fit
     except UnobservableError:
         return None
-    if not (_power(beside) < _QUIETER * _power(before.noise)).any():
+    if not (_power(beside.noise) < _QUIETER * _power(before.noise)).any():
         return None
-    noise = replace(before.noise, sigma_mps2=beside.sigma_mps2, inflation=beside.inflation)
-    quieter = evaluate_fit(replace(before.fit, noise=noise), before.settings)
+    noise = replace(before.noise, sigma_mps2=beside.noise.sigma_mps2, inflation=beside.noise.inflation)
+    dwells = before.fit.dwells.weighted(before.fit.dwells.folded.weights, beside.dwells.folded.correlations)
+    linearised = LinearisedDwells(dwells, before.model, before.linearised.state, before.linearised.slews)
+    quieter = evaluate_fit(replace(before.fit, linearised=linearised, noise=noise), before.settings)
     return replace(quieter, counts=before.counts, readings=before.readings)
 
 
